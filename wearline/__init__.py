@@ -1,0 +1,1 @@
+"""What every Wearline service shares: messages, topics, recipe, artifacts, bus and runner."""
