@@ -1,0 +1,49 @@
+# The verbs of the house. Each sets up what it needs; nothing has to be installed before but Python 3.11+ and make.
+
+SHELL := /bin/sh
+.DEFAULT_GOAL := help
+PROJECTS := pyproject.toml $(wildcard services/*/pyproject.toml)
+export OPENBLAS_NUM_THREADS ?= 1
+export OMP_NUM_THREADS ?= 1
+
+help: ## This list
+	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
+
+.venv/ready-run: constraints.txt $(PROJECTS) deploy/environment.sh
+	@deploy/environment.sh run
+
+.venv/ready-dev: constraints-dev.txt $(PROJECTS) deploy/environment.sh
+	@deploy/environment.sh dev
+
+demo: .venv/ready-run ## A whole simulated cell; STROKES=60 HEADLESS=1 for scripts, DATA=folder, PORT=base port
+	@exec .venv/bin/wearline demo $(if $(STROKES),--strokes $(STROKES)) $(if $(HEADLESS),--headless) \
+	    $(if $(DATA),--data $(DATA)) $(if $(PORT),--base-port $(PORT)) $(if $(STROKE_PERIOD),--stroke-period $(STROKE_PERIOD))
+
+test: .venv/ready-dev ## All tests; WEARLINE_NO_SKIP=1 turns every skip into a failure; T="-k name" passes options
+	@.venv/bin/python -m pytest $(T)
+
+lint: .venv/ready-dev ## ruff, mypy --strict and the dependency rule
+	@.venv/bin/ruff check .
+	@.venv/bin/ruff format --check .
+	@.venv/bin/mypy
+	@.venv/bin/lint-imports
+
+format: .venv/ready-dev ## Let ruff format the tree
+	@.venv/bin/ruff check --fix-only -q . ; .venv/bin/ruff format .
+
+bench: .venv/ready-run ## Speed and precision against known truth
+	@.venv/bin/wearline bench
+
+kills: .venv/ready-dev ## 20 kill -9 while strokes run (long)
+	@.venv/bin/python -m pytest -m slow tests/faults $(T)
+
+images: ## Container images of all services (needs Docker with BuildKit)
+	@deploy/images.sh
+
+constraints: .venv/ready-dev ## Pin all third-party packages anew
+	@deploy/pin.sh
+
+clean: ## Forget the environment and the demo's data
+	rm -rf .venv run build
+
+.PHONY: help demo test lint format bench kills images constraints clean
