@@ -38,10 +38,16 @@ class Health:
     values: Mapping[str, float | int | str | bool | None] = field(default_factory=dict)
 
 
+def _nobody_to_wake() -> None:
+    """Offline there is no loop that sleeps."""
+
+
 class Service:
     """Base of the five services; override what applies."""
 
     name: ClassVar[str]
+    wake: Callable[[], None] = staticmethod(_nobody_to_wake)
+    """Set by the runner before `start`: call it from any thread and `tick` runs at once."""
     tick_s: float | None = None
     """Period of `tick`; None = no tick. [s]"""
 
@@ -59,6 +65,10 @@ class Service:
 
     def tick(self, now_s: float) -> Iterable[Message]:
         """Every `tick_s`, with the monotonic clock. [s]"""
+        return ()
+
+    def on_alive(self, service: str, is_alive: bool) -> Iterable[Message]:
+        """A service of the cell came (also those that were there before) or went."""
         return ()
 
     def health(self) -> Health:

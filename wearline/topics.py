@@ -34,12 +34,15 @@ class Topic:
     message: type[m.Message]
     delivery: Delivery
     rate_hz: float = 0.0
+    keep_s: float | None = None
+    """KEPT only: what is older is not told to late joiners; None = the newest, whatever their age. [s]"""
 
     def key(self, cell: str) -> str:
         return f"wearline/{cell}/{self.publisher}/{self.name}"
 
 
-MEASURE = Topic("measure", "fieldbus", m.MeasureRequest, Delivery.KEPT)
+# A camera that joins late must not take a picture for a stroke that has gone.
+MEASURE = Topic("measure", "fieldbus", m.MeasureRequest, Delivery.KEPT, keep_s=1.0)
 FRAME = Topic("frame", "capture", m.Frame, Delivery.EVERY)
 PREVIEW = Topic("preview", "capture", m.Preview, Delivery.LATEST, 3.0)
 LINE_POINTS = Topic("line_points", "reconstruct", m.LinePoints, Delivery.EVERY)
