@@ -1,0 +1,1 @@
+"""Judge: line points to verdict, production records and wear trend."""

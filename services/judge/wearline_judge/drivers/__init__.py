@@ -1,0 +1,1 @@
+"""What judge keeps on disk: records, frames, object list."""
