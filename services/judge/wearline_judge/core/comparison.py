@@ -147,7 +147,7 @@ def compare(
         if turn == 1 or not (step.dx or step.dy):
             break
         shift_px = (motion.dx / unit, motion.dy / unit)
-        motion = _held(motion, registration, scale is not None, datum is not None)
+    motion = _held(motion, registration, scale is not None, datum is not None)
     rest_x, rest_y = motion.dx - shift_px[0] * unit, motion.dy - shift_px[1] * unit
     cells = cells - motion.height(x, y) + slope_x * rest_x + slope_y * rest_y
     px, py = golden.x_px - middle_x, golden.y_px - middle_y
@@ -165,9 +165,7 @@ def compare(
         np.asarray(deviates & np.isfinite(cells)), cells, sigma, area, x_px, y_px, precision_mm, floor_px, scale,
         sigma_frame_mm, settings,
     )  # fmt: skip
-    return Comparison(
-        cells, sigma, area, label, expected, seen, regions, motion, np.where(valid, points, np.nan)
-    )
+    return Comparison(cells, sigma, area, label, expected, seen, regions, motion, np.where(valid, points, np.nan))
 
 
 def _held(motion: Motion, settings: RegistrationSettings, is_in_mm: bool, has_datum: bool) -> Motion:
@@ -227,7 +225,9 @@ def _regions(
                 row_px=float(np.sum(ys * weight) / size),
                 col_px=float(np.sum(xs * weight) / size),
                 box_px=(
-                    round(left), round(top), round(float(np.max(xs + half)) - left),
+                    round(left),
+                    round(top),
+                    round(float(np.max(xs + half)) - left),
                     round(float(np.max(ys + half)) - top),
                 ),
             )  # fmt: skip
