@@ -1,0 +1,1 @@
+"""What the screen says, as pure functions of the messages and a passed clock."""

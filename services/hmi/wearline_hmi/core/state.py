@@ -1,0 +1,222 @@
+"""The cell as the screen knows it: frozen snapshots, made from messages and the monotonic clock.
+
+A snapshot may be read by any thread; only the thread that handles messages makes the next one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from wearline.messages import Event, Outcome, Preview, Records, ServiceState, Verdict, View, WearTrend
+from wearline.topics import SERVICES
+
+STROKES_KEPT = 200
+EVENTS_KEPT = 100
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """One row of the table of last strokes."""
+
+    cycle_id: str
+    stroke: int
+    part_id: str
+    utc: str
+    """ISO 8601; empty until fieldbus or judge told the time."""
+    decision: str
+    code: int
+    reason: str
+    mean_mm: float | None
+    max_mm: float | None
+    cycle_ms: float | None
+    """From the Measure edge to the result written; None while unknown. [ms]"""
+    told_code: int | None
+    """What the PLC was told; None until then."""
+    is_simulated: bool
+    object_index: int = 0
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The last state of one service, and when it arrived."""
+
+    state: ServiceState | None = None
+    at_s: float | None = None
+    """Monotonic clock of this machine. [s]"""
+    is_alive: bool | None = None
+    """Its liveliness token; None = never heard of."""
+
+
+@dataclass(frozen=True)
+class CellState:
+    """All that the page shows."""
+
+    cell: str
+    verdict: Verdict | None = None
+    verdict_at_s: float | None = None
+    view: View | None = None
+    view_at_s: float | None = None
+    preview: Preview | None = None
+    preview_at_s: float | None = None
+    preview_serial: int = 0
+    outcome: Outcome | None = None
+    strokes: tuple[Stroke, ...] = ()
+    """Newest first."""
+    events: tuple[Event, ...] = ()
+    """Newest first."""
+    services: dict[str, Seen] = field(default_factory=lambda: {name: Seen() for name in SERVICES})
+    trends: tuple[WearTrend, ...] = ()
+    total: int = 0
+    passed: int = 0
+    failed: int = 0
+    not_measured: int = 0
+    records_at_s: float | None = None
+
+
+def with_verdict(state: CellState, verdict: Verdict, now_s: float) -> CellState:
+    """The snapshot after judge's verdict; one that was already shown changes nothing."""
+    if any(row.cycle_id == verdict.cycle_id for row in state.strokes[:20]):
+        if state.verdict is None or state.verdict.cycle_id != verdict.cycle_id:
+            return state if state.verdict is not None else replace(state, verdict=verdict, verdict_at_s=now_s)
+        return state
+    row = Stroke(
+        cycle_id=verdict.cycle_id,
+        stroke=verdict.request.stroke,
+        part_id=verdict.request.part_id,
+        utc="",
+        decision=verdict.decision.value,
+        code=verdict.code,
+        reason=verdict.reason,
+        mean_mm=verdict.mean_error_mm,
+        max_mm=verdict.max_error_mm,
+        cycle_ms=None,
+        told_code=None,
+        is_simulated=verdict.is_simulated,
+        object_index=verdict.request.object_index,
+    )
+    return replace(state, verdict=verdict, verdict_at_s=now_s, strokes=(row, *state.strokes)[:STROKES_KEPT])
+
+
+def with_outcome(state: CellState, outcome: Outcome) -> CellState:
+    """The snapshot after fieldbus told the PLC; also for a cycle that never had a verdict."""
+    told = outcome.code if outcome.was_told else None
+    cycle_ms = 1000.0 * outcome.cycle_seconds
+    rows = list(state.strokes)
+    for index, row in enumerate(rows):
+        if row.cycle_id == outcome.cycle_id:
+            rows[index] = replace(row, utc=outcome.told_utc, cycle_ms=cycle_ms, told_code=told)
+            return replace(state, outcome=outcome, strokes=tuple(rows))
+    decision = {1: "PASSED", 2: "FAILED", 3: "UNSURE"}.get(outcome.code, "NOT_MEASURED")
+    row = Stroke(
+        cycle_id=outcome.cycle_id,
+        stroke=outcome.request.stroke,
+        part_id=outcome.request.part_id,
+        utc=outcome.told_utc,
+        decision=decision,
+        code=outcome.code,
+        reason="",
+        mean_mm=None,
+        max_mm=None,
+        cycle_ms=cycle_ms,
+        told_code=told,
+        is_simulated=outcome.is_simulated,
+        object_index=outcome.request.object_index,
+    )
+    return replace(state, outcome=outcome, strokes=(row, *rows)[:STROKES_KEPT])
+
+
+def with_view(state: CellState, view: View, now_s: float) -> CellState:
+    """The snapshot with the newest maps."""
+    return replace(state, view=view, view_at_s=now_s)
+
+
+def with_preview(state: CellState, preview: Preview, now_s: float) -> CellState:
+    """The snapshot with the newest camera picture."""
+    return replace(state, preview=preview, preview_at_s=now_s, preview_serial=state.preview_serial + 1)
+
+
+def with_service(state: CellState, told: ServiceState, now_s: float) -> CellState:
+    """The snapshot after a service said how it is."""
+    seen = Seen(told, now_s, True)
+    return replace(state, services={**state.services, told.service: seen})
+
+
+def with_alive(state: CellState, service: str, is_alive: bool) -> CellState:
+    """The snapshot after a service's liveliness token came or went."""
+    if service not in state.services:
+        return state
+    seen = replace(state.services[service], is_alive=is_alive)
+    return replace(state, services={**state.services, service: seen})
+
+
+def with_event(state: CellState, event: Event) -> CellState:
+    """The snapshot with one more line in the log; late joiners may hear old events again."""
+    if event in state.events:
+        return state
+    events = sorted((event, *state.events), key=lambda e: e.utc, reverse=True)
+    return replace(state, events=tuple(events[:EVENTS_KEPT]))
+
+
+def with_records(state: CellState, records: Records, now_s: float) -> CellState:
+    """The snapshot after judge's records: they rule, and what is newer than them stays on top."""
+    known = {row.cycle_id for row in records.rows}
+    newer: list[Stroke] = []
+    for row in state.strokes:
+        if row.cycle_id in known:
+            break
+        newer.append(row)
+    cycle_ms = {row.cycle_id: (row.cycle_ms, row.utc, row.told_code) for row in state.strokes}
+    recorded = []
+    for record in records.rows:
+        heard_ms, heard_utc, heard_told = cycle_ms.get(record.cycle_id, (None, "", None))
+        seconds = record.cycle_seconds
+        recorded.append(
+            Stroke(
+                cycle_id=record.cycle_id,
+                stroke=record.stroke,
+                part_id=record.part_id,
+                utc=heard_utc or record.utc,
+                decision=record.decision.value,
+                code=record.code,
+                reason=record.reason,
+                mean_mm=record.mean_error_mm,
+                max_mm=record.max_error_mm,
+                cycle_ms=1000.0 * seconds if seconds is not None else heard_ms,
+                told_code=record.told_code if record.told_code is not None else heard_told,
+                is_simulated=record.is_simulated,
+                object_index=record.object_index,
+            )
+        )
+    return replace(
+        state,
+        strokes=(*newer, *recorded)[:STROKES_KEPT],
+        trends=records.trends,
+        total=records.total,
+        passed=records.passed,
+        failed=records.failed,
+        not_measured=records.not_measured,
+        records_at_s=now_s,
+    )
+
+
+def is_simulated(state: CellState) -> bool:
+    """True when anything that is shown came from a simulated chain."""
+    return any(part is not None and part.is_simulated for part in (state.verdict, state.preview, state.view))
+
+
+def current_object(state: CellState) -> int | None:
+    """The object index that the cell works on, as far as anybody said."""
+    told = state.services["fieldbus"].state
+    index = None if told is None else told.values.get("object_index")
+    if isinstance(index, int) and not isinstance(index, bool):
+        return index
+    return None if state.verdict is None else state.verdict.request.object_index
+
+
+def trend_of(state: CellState) -> WearTrend | None:
+    """The wear trend of the current object."""
+    wanted = current_object(state)
+    for trend in state.trends:
+        if trend.object_index == wanted:
+            return trend
+    return state.trends[0] if len(state.trends) == 1 else None

@@ -1,0 +1,169 @@
+"""Figures and words as people read them on the panel."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from wearline.messages import CODE_MEANING, ResultCode
+from wearline_hmi.core.state import CellState, Seen, Stroke, current_object
+
+STATE_FRESH_S = 3.0
+STATE_LOST_S = 6.0
+PREVIEW_STALE_S = 3.0
+DASH = "–"
+
+
+def age_text(age_s: float | None) -> str:
+    """'just now', '12 s ago', '3 min ago' or '2 h 05 min ago'; a dash when nothing came yet."""
+    if age_s is None:
+        return DASH
+    if age_s < 1.0:
+        return "just now"
+    if age_s < 120.0:
+        return f"{int(age_s)} s ago"
+    minutes = int(age_s // 60)
+    if minutes < 120:
+        return f"{minutes} min ago"
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02d} min ago" if hours < 48 else f"{hours // 24} days ago"
+
+
+def mm_text(value_mm: float | None, sign: bool = False) -> str:
+    """Three decimals, a true minus sign, a dash for what was not measured."""
+    if value_mm is None or not math.isfinite(value_mm):
+        return DASH
+    if abs(value_mm) < 0.0005:
+        return "0.000"
+    return (f"{value_mm:+.3f}" if sign else f"{value_mm:.3f}").replace("-", "−")
+
+
+def ms_text(value_ms: float | None) -> str:
+    """Whole milliseconds, or a dash."""
+    return DASH if value_ms is None or not math.isfinite(value_ms) else f"{value_ms:.0f}"
+
+
+def time_text(utc: str) -> str:
+    """The time of day of an ISO 8601 instant, to the second, UTC."""
+    return utc[11:19] if len(utc) >= 19 and utc[10] in "T " else DASH
+
+
+def code_text(code: int) -> str:
+    """What a result code means."""
+    try:
+        return CODE_MEANING[ResultCode(code)]
+    except ValueError:
+        return f"result code {code}"
+
+
+@dataclass(frozen=True)
+class Sign:
+    """A state as colour, shape and word: each of the three says it alone."""
+
+    colour: str
+    """green, red, amber or grey: a class of the style sheet."""
+    icon: str
+    """check, cross, question, dash, warn or clock: a shape of the style sheet."""
+    word: str
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class VerdictSign:
+    """The big panel."""
+
+    sign: Sign
+    age: str
+    is_stale: bool
+    is_told: bool
+    """The PLC got this very result."""
+
+
+_DECISIONS = {
+    "PASSED": ("green", "check", "PASSED"),
+    "FAILED": ("red", "cross", "FAILED"),
+    "UNSURE": ("amber", "question", "UNSURE"),
+    "NOT_MEASURED": ("amber", "warn", "NOT MEASURED"),
+}
+
+
+def decision_sign(decision: str, detail: str = "") -> Sign:
+    """Colour, shape and word of one decision."""
+    colour, icon, word = _DECISIONS[decision]
+    return Sign(colour, icon, word, detail)
+
+
+def verdict_sign(state: CellState, now_s: float, stale_after_s: float) -> VerdictSign:
+    """What the big panel says at `now_s`: the newest stroke, or that there is none.
+
+    An outcome that contradicts the verdict (the deadline had gone, a simulated verdict was refused)
+    rules: the panel shows what the PLC was told.
+    """
+    verdict, at_s = state.verdict, state.verdict_at_s
+    if verdict is None or at_s is None:
+        return VerdictSign(Sign("grey", "dash", "NO VERDICT", "No stroke was measured since this screen started"),
+                           DASH, True, False)  # fmt: skip
+    age_s = max(0.0, now_s - at_s)
+    sign = decision_sign(verdict.decision.value, verdict.reason or code_text(verdict.code))
+    newest = next((row for row in state.strokes if row.cycle_id == verdict.cycle_id), None)
+    outcome = state.outcome
+    is_told = newest is not None and newest.told_code is not None
+    if outcome is not None and outcome.cycle_id == verdict.cycle_id:
+        if not outcome.was_told:
+            sign = Sign("amber", "warn", sign.word, f"THE PLC WAS NOT TOLD. {sign.detail}")
+        elif outcome.code >= 10 and verdict.decision.value != "NOT_MEASURED":
+            sign = decision_sign("NOT_MEASURED", code_text(outcome.code))
+    return VerdictSign(sign, age_text(age_s), age_s > stale_after_s, is_told)
+
+
+def service_sign(seen: Seen, now_s: float) -> Sign:
+    """Colour, shape, word and age of one service."""
+    age_s = None if seen.at_s is None else max(0.0, now_s - seen.at_s)
+    if seen.state is None or age_s is None:
+        return Sign("red" if seen.is_alive is False else "grey", "cross" if seen.is_alive is False else "dash",
+                    "gone" if seen.is_alive is False else "not heard yet", DASH)  # fmt: skip
+    age = "now" if age_s < 1.5 else age_text(age_s).removesuffix(" ago")
+    if seen.is_alive is False or age_s > STATE_LOST_S:
+        return Sign("red", "cross", "lost", age)
+    if age_s > STATE_FRESH_S:
+        return Sign("amber", "clock", "late", age)
+    colour, icon = {"ready": ("green", "check"), "degraded": ("amber", "warn")}.get(
+        seen.state.status, ("amber", "clock")
+    )
+    return Sign(colour, icon, seen.state.status, age)
+
+
+@dataclass(frozen=True)
+class HeaderWords:
+    """The line at the top."""
+
+    mode: Sign
+    plc: Sign
+    object_text: str
+
+
+def header_words(state: CellState, now_s: float) -> HeaderWords:
+    """Mode, PLC link and object; what fieldbus said too long ago is unknown, not true."""
+    seen = state.services["fieldbus"]
+    index = current_object(state)
+    object_text = DASH if index is None else str(index)
+    told = seen.state
+    if told is None or seen.at_s is None or seen.is_alive is False or now_s - seen.at_s > STATE_LOST_S:
+        return HeaderWords(Sign("grey", "dash", "unknown"), Sign("red", "cross", "unknown"), object_text)
+    mode = str(told.values.get("mode") or "unknown")
+    mode_sign = Sign("green" if mode == "auto" else "amber" if mode == "manual" else "grey",
+                     "check" if mode == "auto" else "dash", mode)  # fmt: skip
+    link = told.values.get("plc_link_up")
+    if link is None:
+        plc = Sign("grey", "dash", "unknown")
+    else:
+        plc = Sign("green", "check", "up") if link else Sign("red", "cross", "DOWN")
+    return HeaderWords(mode_sign, plc, object_text)
+
+
+def stroke_sign(row: Stroke) -> Sign:
+    """The verdict column: the word of the decision; amber where the PLC was told something else."""
+    sign = decision_sign(row.decision)
+    if row.told_code is not None and row.told_code >= 10 and row.decision in ("PASSED", "FAILED", "UNSURE"):
+        return Sign("amber", "warn", "NOT MEASURED", code_text(row.told_code))
+    return Sign(sign.colour, sign.icon, sign.word, row.reason)

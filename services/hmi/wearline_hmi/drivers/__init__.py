@@ -1,0 +1,1 @@
+"""The outside things of the web interface: the web server."""
