@@ -230,7 +230,7 @@ def _regions(
                     round(float(np.max(xs + half)) - left),
                     round(float(np.max(ys + half)) - top),
                 ),
-            )  # fmt: skip
+            )
         )
         label[at] = len(found)
     return label, tuple(found)

@@ -99,7 +99,7 @@ def _slopes(field: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np
     weight = cv2.GaussianBlur(known, (0, 0), _SLOPE_SMOOTHING_PX)
     smooth = cv2.GaussianBlur(filled, (0, 0), _SLOPE_SMOOTHING_PX) / np.maximum(weight, 1e-3)
     smooth = np.where(known > 0, smooth, np.nan).astype(np.float32)
-    slopes = []
+    slopes: list[NDArray[np.float32]] = []
     for axis in (1, 0):
         rise = np.full_like(smooth, np.nan)
         ahead = np.roll(smooth, -_SLOPE_STEP_PX, axis)

@@ -56,7 +56,7 @@ def block_sum(values: NDArray[np.generic]) -> F64:
     blocks = -(-along // BLOCK)
     padded = np.zeros((lines, blocks * BLOCK))
     padded[:, :along] = values
-    return padded.reshape(lines, blocks, BLOCK).sum(axis=2)
+    return np.asarray(padded.reshape(lines, blocks, BLOCK).sum(axis=2))
 
 
 def block_mean(values: F64, is_valid: Bool) -> F64:

@@ -34,9 +34,8 @@ def digest(number: int, kind: str, cycle_id: str, utc: str, body: str, previous:
 
 def first_fault(entries: Iterable[Entry]) -> str | None:
     """What is wrong with the first entry that does not fit the chain, or None."""
-    previous, number = FIRST, 0
-    for entry in entries:
-        number += 1
+    previous = FIRST
+    for number, entry in enumerate(entries, 1):
         if entry.number != number:
             return f"entry {number} is missing"
         if entry.previous != previous:

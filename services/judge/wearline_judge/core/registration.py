@@ -131,7 +131,8 @@ def register(
     flat = np.column_stack([np.ones_like(d), ys, xs])
     still, still_reach = _robust(flat, d, weight, np.array([float(np.median(d)), 0.0, 0.0]))
 
-    shift_x, shift_y, undetermined, shift_sigma = 0.0, 0.0, _NAMES, 0.0
+    shift_x, shift_y, shift_sigma = 0.0, 0.0, 0.0
+    undetermined: tuple[str, ...] = _NAMES
     moved, reach = still, still_reach
     axes, sigmas = _determined(gx, gy, flat, s, settings, is_in_mm)
     if axes.shape[1]:

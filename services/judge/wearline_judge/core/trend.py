@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wearline.recipe import Recipe
+from wearline_judge.core.line_grid import F64
 
 _FITTED = 200
 """Newest points that the slope is taken from; wear is not straight over a die's whole life."""
@@ -48,7 +49,7 @@ def wear_limit(recipe: Recipe, mean_errors: Sequence[float], wears: Sequence[flo
     return recipe.limits.mean_error_mm * ratio
 
 
-def theil_sen(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:  # type: ignore[type-arg]
+def theil_sen(x: F64, y: F64) -> tuple[float, float, float]:
     """Median slope of all pairs, the median intercept, and the slope's standard uncertainty.
 
     The uncertainty is that of the least-squares slope with the residuals' robust standard
