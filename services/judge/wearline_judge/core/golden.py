@@ -108,7 +108,7 @@ def _slopes(field: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np
         inner[axis] = slice(_SLOPE_STEP_PX, -_SLOPE_STEP_PX)
         where = tuple(inner)
         rise[where] = (ahead - behind)[where] / (2.0 * _SLOPE_STEP_PX)
-        slopes.append(rise)
+        slopes.append(rise.astype(np.float32))
     return slopes[0], slopes[1]
 
 
