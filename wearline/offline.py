@@ -6,7 +6,6 @@ calibration, template) and passes each message from one handler to the next.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import struct
 import zlib
@@ -248,7 +247,7 @@ def _decoded(content: bytes, where: str) -> U8:
 
 def _check_png(content: bytes, where: str) -> None:
     """Walk the chunks: a decoder fills what is missing with black, and black is no measurement."""
-    at, has_data = len(_PNG), False
+    at, packed, expected = len(_PNG), bytearray(), 0
     while True:
         if at + 12 > len(content):
             raise _refused("is truncated", where)
@@ -259,18 +258,24 @@ def _check_png(content: bytes, where: str) -> None:
         if zlib.crc32(content[at + 4 : end - 4]) != struct.unpack_from(">I", content, end - 4)[0]:
             raise _refused("is damaged (checksum)", where)
         if kind == b"IHDR":
-            width, height, depth, colour = struct.unpack_from(">IIBB", content, at + 8)
+            width, height, depth, colour, _, _, interlaced = struct.unpack_from(">IIBBBBB", content, at + 8)
             _check_size(width, height, where)
             if colour != 0:
                 raise _refused("is a colour or palette picture", where)
             if depth != 8:
                 raise _refused(f"has {depth} bits per pixel instead of 8", where)
-        has_data = has_data or kind == b"IDAT"
+            expected = 0 if interlaced else height * (width + 1)
+        if kind == b"IDAT":
+            packed += content[at + 8 : end - 4]
         if kind == b"IEND":
             break
         at = end
-    if not has_data:
-        raise _refused("holds no pixels", where)
+    try:
+        rows = zlib.decompressobj().decompress(packed, PIXEL_LIMIT * 2)
+    except zlib.error as error:
+        raise _refused("is damaged (pixels)", where) from error
+    if len(rows) < expected or not rows:
+        raise _refused("is truncated", where)
 
 
 def _check_size(width: int, height: int, where: str) -> None:
@@ -301,8 +306,3 @@ def _check_jpeg(content: bytes, where: str) -> None:
             return
         at += 2 + length
     raise _refused("is truncated", where)
-
-
-def frame_hash(pixels: U8) -> str:
-    """sha256 of the pixels, hex: the name of a frame in records and store."""
-    return hashlib.sha256(np.ascontiguousarray(pixels).tobytes()).hexdigest()
