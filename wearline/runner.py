@@ -18,6 +18,7 @@ from concurrent.futures import Future, InvalidStateError
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -142,7 +143,7 @@ class Runner:
         self._inbox.close()
 
     def facts(self) -> tuple[bool, Mapping[str, object]]:
-        """For /healthz: well means that the loop turns, the router is there, and the service is not starting or stopping.
+        """For /healthz: well = the loop turns, the router is there, the service is neither starting nor stopping.
 
         A degraded service is well: to start it anew would not bring back its camera.
         """
@@ -162,15 +163,19 @@ class Runner:
     def run(self) -> None:
         """Start, serve until `stop`, close."""
         service, bus = self._service, self._bus
-        service.wake = self._inbox.wake  # type: ignore[method-assign, unused-ignore]
+        service.wake = self._inbox.wake
+        for name in SERVICES:
+            metrics.SERVICE_UP.labels(bus.cell, name).set(0.0)
         try:
-            self._do("start", lambda: service.start(bus))
+            # A service that cannot start must not seem to run; whoever supervises it starts it anew.
+            for message in service.start(bus):
+                bus.publish(message)
             handlers = service.handlers()
             for topic in handlers:
-                bus.subscribe(topic, lambda message, topic=topic: self._put(topic, message))
+                bus.subscribe(topic, partial(self._put, topic))
             for query in service.answers():
-                bus.answer(query, lambda question, query=query: self._answer(query, question))
-            bus.watch_alive(lambda name, is_alive: self._put_alive(name, is_alive))
+                bus.answer(query, partial(self._answer, query))
+            bus.watch_alive(self._put_alive)
             bus.announce()
             self._loop(handlers, service.answers())
         finally:
@@ -209,14 +214,14 @@ class Runner:
             item, is_woken = self._inbox.take(max(0.0, due_s - self._clock()))
             now_s = self._turned_s = self._clock()
             if isinstance(item, _Arrived):
-                self._do(item.topic.name, lambda item=item: handlers[item.topic](item.message))
+                self._do(item.topic.name, partial(handlers[item.topic], item.message))
             elif isinstance(item, _Asked):
                 self._reply(item, answers[item.query])
             elif isinstance(item, _Alive):
-                self._do("alive", lambda item=item: self._service.on_alive(item.service, item.is_alive))
+                self._do("alive", partial(self._service.on_alive, item.service, item.is_alive))
             now_s = self._clock()
             if is_woken or (period_s is not None and now_s >= next_tick_s):
-                self._do("tick", lambda now_s=now_s: self._service.tick(now_s))
+                self._do("tick", partial(self._service.tick, now_s))
                 # After a long handler the ticks that were missed are not made up for.
                 next_tick_s = (
                     max(next_tick_s + (period_s or 0.0), self._clock()) if now_s >= next_tick_s else next_tick_s
