@@ -13,7 +13,9 @@ import sys
 from argparse import REMAINDER, ArgumentParser, Namespace
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
@@ -38,7 +40,7 @@ class Command:
 
 class _Parser(ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        raise UsageError(message, self.prog, f"see '{self.prog} --help'")
+        raise UsageError(message, self.prog.removeprefix("wearline").strip(), f"see '{self.prog} --help'")
 
 
 def progress(items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
@@ -81,13 +83,11 @@ def _run_service(arguments: Namespace) -> int:
     name = arguments.service
     if name not in SERVICES:
         raise UsageError(f"there is no service '{name}'", "wearline run", f"one of {', '.join(SERVICES)}")
+    module = f"wearline_{name}"
+    if find_spec(module) is None or find_spec(f"{module}.__main__") is None:
+        raise UsageError("is not installed here", f"service {name}", f"pip install wearline-{name}")
     sys.argv = [f"wearline run {name}", *arguments.rest]
-    try:
-        runpy.run_module(f"wearline_{name}", run_name="__main__", alter_sys=False)
-    except ModuleNotFoundError as error:
-        if error.name is not None and error.name.startswith("wearline_"):
-            raise UsageError("is not installed here", f"service {name}", f"pip install wearline-{name}") from error
-        raise
+    runpy.run_module(module, run_name="__main__", alter_sys=False)
     return 0
 
 
@@ -114,8 +114,10 @@ def _run_up(arguments: Namespace) -> int:
 
 
 def _demo() -> Command:
-    from wearline.demo import DEMO
-
+    try:
+        from wearline.demo import DEMO
+    except ImportError as error:
+        raise UsageError(f"needs {error.name}", "command demo", "pip install 'wearline[demo]'") from error
     return DEMO
 
 
@@ -146,13 +148,19 @@ def _commands(wanted: str | None) -> list[Command]:
         return [_BUILT_IN[wanted]()]
     if wanted in offered:
         return [_load(offered[wanted])]
-    found = []
-    for make in [*_BUILT_IN.values(), *(lambda p=p: _load(p) for p in offered.values())]:
-        try:
-            found.append(make())
-        except (UsageError, ImportError) as error:
-            sys.stderr.write(f"wearline: {' '.join(str(error).split())}\n")
-    return found
+    makers: dict[str, Callable[[], Command]] = {
+        **_BUILT_IN,
+        **{name: partial(_load, point) for name, point in offered.items()},
+    }
+    return [_offered(name, make) for name, make in makers.items()]
+
+
+def _offered(name: str, make: Callable[[], Command]) -> Command:
+    """For the list of commands: one that cannot be loaded says so in its place."""
+    try:
+        return make()
+    except (UsageError, ImportError) as error:
+        return Command(name, f"not available here ({' '.join(str(error).split())})", lambda _: None, lambda _: 2)
 
 
 def _parser(wanted: str | None) -> ArgumentParser:
@@ -160,7 +168,7 @@ def _parser(wanted: str | None) -> ArgumentParser:
     parser.add_argument("--version", action="version", version=f"wearline {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for command in _commands(wanted):
-        subparser = subparsers.add_parser(command.name, help=command.help, description=command.help)
+        subparser = subparsers.add_parser(command.name, help=command.help.replace("%", "%%"), description=command.help)
         command.configure(subparser)
         subparser.set_defaults(run_command=command.run)
     return parser

@@ -41,6 +41,8 @@ STEADY_S = 10.0
 """A process that lived so long starts with the first pause again. [s]"""
 TERM_S = 2.0
 """From SIGTERM to SIGKILL. [s]"""
+ROUTER_TERM_S = 0.4
+"""The part of it that is the router's. [s]"""
 LOG_LIMIT_BYTES = 10 * 2**20
 """A log file beyond this moves to <name>.log.1. Twice this, for each process, is all that logs take."""
 LOG_LOOK_S = 5.0
@@ -136,13 +138,13 @@ class Supervisor:
         for process in self._processes:
             process.due_s = None
         # The services say goodbye on the bus, so the router goes last.
-        for group in (self._processes[1:], self._processes[:1]):
+        # A hung service must leave the router its time to stop.
+        for group, spare_s in ((self._processes[1:], ROUTER_TERM_S), (self._processes[:1], 0.0)):
             running = [p.popen for p in group if p.popen is not None]
             for popen in running:
                 _signal(popen, signal.SIGTERM)
             for popen in running:
-                # A hung service must leave the router its time to stop.
-                _wait(popen, deadline_s - time.monotonic() - (0.4 if group is not self._processes[:1] else 0.0))
+                _wait(popen, deadline_s - spare_s - time.monotonic())
             for popen in running:
                 if popen.poll() is None:
                     _signal(popen, signal.SIGKILL)
