@@ -193,7 +193,8 @@ FILE_LIMIT_BYTES = 256 * 2**20
 PIXEL_LIMIT = 2**27
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
-_OTHERS = (b"BM", b"II*\0", b"MM\0*", b"P5")
+_TIFF = (b"II*\0", b"MM\0*")
+_OTHERS = (b"BM", b"P5")
 _CURE = "take an 8-bit grey picture of the whole sensor"
 
 
@@ -218,6 +219,8 @@ def read_frame(path: Path) -> U8:
         _check_png(content, where)
     elif content.startswith(_JPEG):
         _check_jpeg(content, where)
+    elif content.startswith(_TIFF):
+        _check_tiff(content, where)
     elif not content.startswith(_OTHERS):
         raise _refused("is no image file (PNG, JPEG, BMP, TIFF, PGM)", where, "name an image file")
     return _decoded(content, where)
@@ -232,6 +235,8 @@ def _decoded(content: bytes, where: str) -> U8:
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(PIXEL_LIMIT))
     import cv2
 
+    # What it would print beside our own sentence.
+    cv2.setLogLevel(0)
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -305,4 +310,16 @@ def _check_jpeg(content: bytes, where: str) -> None:
                 raise _refused("is truncated", where)
             return
         at += 2 + length
+    raise _refused("is truncated", where)
+
+
+def _check_tiff(content: bytes, where: str) -> None:
+    """The first directory to its last byte: it may be the end of the file, and the decoder forgives that."""
+    order = "<" if content.startswith(b"II") else ">"
+    if len(content) >= 8:
+        (at,) = struct.unpack_from(f"{order}I", content, 4)
+        if at + 2 <= len(content):
+            (entries,) = struct.unpack_from(f"{order}H", content, at)
+            if at + 2 + 12 * entries + 4 <= len(content):
+                return
     raise _refused("is truncated", where)
