@@ -236,7 +236,7 @@ def _decoded(content: bytes, where: str) -> U8:
     import cv2
 
     # What it would print beside our own sentence.
-    cv2.setLogLevel(0)
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
