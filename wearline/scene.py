@@ -507,6 +507,21 @@ def wear_at(stroke: int, regrinds: Sequence[int] = ()) -> float:
     return WEAR_AT_LIMIT_MM * float(((count + 0.9 * (jitter - 0.5)) / STROKES_TO_LIMIT) ** 1.5)
 
 
+def part_of_stroke(stroke: int, regrinds: Sequence[int] = (), seed: int = 1) -> StampedPart:
+    """What the demo die makes of one stroke: its wear, and a pose and spring-back that scatter; always the same part."""
+    rng = np.random.default_rng([seed, stroke, 20])
+    dx, dy, dz, tilt_x, tilt_y, spring = (float(v) for v in rng.standard_normal(6))
+    return StampedPart(
+        wear_mm=wear_at(stroke, regrinds),
+        dx_mm=0.03 * dx,
+        dy_mm=0.03 * dy,
+        dz_mm=0.03 * dz,
+        tilt_x_mrad=0.2 * tilt_x,
+        tilt_y_mrad=0.2 * tilt_y,
+        spring_mm=0.004 * spring,
+    )
+
+
 def true_errors(head: Head, worn: Surface, golden: Surface, precision_mm: float = 0.05) -> tuple[float, float]:
     """Mean absolute deviation where it exceeds `precision_mm` (0 = nowhere) and largest signed one, worn - golden. [mm]
 

@@ -1,0 +1,1 @@
+"""Wearline capture: camera drivers to frames."""

@@ -1,0 +1,1 @@
+"""Cameras: one Protocol, one file per kind."""
