@@ -508,7 +508,7 @@ def wear_at(stroke: int, regrinds: Sequence[int] = ()) -> float:
 
 
 def part_of_stroke(stroke: int, regrinds: Sequence[int] = (), seed: int = 1) -> StampedPart:
-    """What the demo die makes of one stroke: its wear, and a pose and spring-back that scatter; always the same part."""
+    """What the demo die makes of one stroke: worn, with a pose and spring-back that scatter; always the same part."""
     rng = np.random.default_rng([seed, stroke, 20])
     dx, dy, dz, tilt_x, tilt_y, spring = (float(v) for v in rng.standard_normal(6))
     return StampedPart(

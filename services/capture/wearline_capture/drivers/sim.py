@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import threading
+import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -104,6 +105,21 @@ def read_regrinds(path: Path) -> tuple[int, ...]:
         ) from error
 
 
+class _Ahead:
+    """A frame that may be wanted soon."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        self.hurry = threading.Event()
+        self.is_dropped = False
+        self.future: Future[Rendered | None] = Future()
+
+    def drop(self) -> None:
+        """Nobody wants it any more; a worker that still pauses before it renders nothing."""
+        self.is_dropped = True
+        self.hurry.set()
+
+
 class SimCamera:
     """Shows the part of the request's stroke and notes the truth about it in ``folder``."""
 
@@ -119,8 +135,7 @@ class SimCamera:
         self._rendered_late = 0
         self._closed = threading.Event()
         self._worker = ThreadPoolExecutor(1, "render", initializer=_lower_priority)
-        self._hurry = threading.Event()
-        self._ahead: tuple[Plan, Future[Rendered]] | None = None
+        self._ahead: _Ahead | None = None
         try:
             regrinds = read_regrinds(self._die)
         except DeviceError:
@@ -128,13 +143,10 @@ class SimCamera:
         self._prepare(Plan(self._last_stroke() + 1, regrinds, exposure_us, gain_db), 0.0)
 
     def shoot(self, request: MeasureRequest, exposure_us: float, gain_db: float) -> Shot:
-        done = threading.Timer(exposure_us * 1e-6, lambda: None)
-        done.daemon = True
-        done.start()
+        ready_s = time.monotonic() + exposure_us * 1e-6
         plan = Plan(request.stroke, read_regrinds(self._die), exposure_us, gain_db)
         frame = self._frame(plan)
-        done.join()
-        if self._closed.is_set():
+        if self._closed.wait(max(ready_s - time.monotonic(), 0.0)):
             raise DeviceError("closed during the exposure", self.name)
         self._counter += 1
         self._note(request, frame)
@@ -146,7 +158,8 @@ class SimCamera:
 
     def close(self) -> None:
         self._closed.set()
-        self._hurry.set()
+        if self._ahead is not None:
+            self._ahead.drop()
         self._worker.shutdown(wait=True, cancel_futures=True)
 
     def wait_ahead(self, timeout_s: float) -> int:
@@ -157,31 +170,35 @@ class SimCamera:
         """
         if self._ahead is None:
             raise TimeoutError("no frame is being rendered")
-        self._hurry.set()
-        self._ahead[1].result(timeout_s)
-        return self._ahead[0].stroke
+        self._ahead.hurry.set()
+        self._ahead.future.result(timeout_s)
+        return self._ahead.plan.stroke
 
     def _frame(self, plan: Plan) -> Rendered:
         ahead, self._ahead = self._ahead, None
-        self._hurry.set()
-        if ahead is not None and ahead[0] == plan:
-            return ahead[1].result()
+        if ahead is not None and ahead.plan == plan:
+            ahead.hurry.set()
+            frame = ahead.future.result()
+            if frame is not None:
+                return frame
         if ahead is not None:
-            ahead[1].cancel()
-            self._rendered_late += 1
+            ahead.drop()
+        self._rendered_late += 1
         # On this thread: the worker cannot raise its priority again.
         return rendered(self.head, plan, self._settings.seed, self._settings.vibration_px)
 
     def _prepare(self, plan: Plan, delay_s: float) -> None:
-        # An event of its own for each frame: a worker that is still busy with another keeps to that one's.
-        self._hurry = hurry = threading.Event()
+        ahead = _Ahead(plan)
 
-        def run() -> Rendered:
-            hurry.wait(delay_s)
+        def run() -> Rendered | None:
+            ahead.hurry.wait(delay_s)
+            if ahead.is_dropped:
+                return None
             return rendered(self.head, plan, self._settings.seed, self._settings.vibration_px)
 
         if not self._closed.is_set():
-            self._ahead = (plan, self._worker.submit(run))
+            ahead.future = self._worker.submit(run)
+            self._ahead = ahead
 
     def _note(self, request: MeasureRequest, frame: Rendered) -> None:
         line = {
