@@ -143,6 +143,8 @@ class SimCamera:
         self._prepare(Plan(self._last_stroke() + 1, regrinds, exposure_us, gain_db), 0.0)
 
     def shoot(self, request: MeasureRequest, exposure_us: float, gain_db: float) -> Shot:
+        if self._closed.is_set():
+            raise DeviceError("is closed", self.name)
         ready_s = time.monotonic() + exposure_us * 1e-6
         plan = Plan(request.stroke, read_regrinds(self._die), exposure_us, gain_db)
         frame = self._frame(plan)
