@@ -1,0 +1,1 @@
+"""reconstruct: one frame to heights with an uncertainty for every point."""

@@ -1,0 +1,1 @@
+"""Pure functions: no bus, clock, thread, file or log."""
