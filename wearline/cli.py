@@ -98,8 +98,11 @@ def _configure_router(parser: ArgumentParser) -> None:
 def _run_router(arguments: Namespace) -> int:
     from wearline.bus import router
     from wearline.config import load_cell
+    from wearline.log import start_log
 
-    return router(load_cell(arguments.config))
+    cell = load_cell(arguments.config)
+    start_log(cell.cell, "router")
+    return router(cell)
 
 
 def _configure_up(parser: ArgumentParser) -> None:
