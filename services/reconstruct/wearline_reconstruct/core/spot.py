@@ -1,0 +1,91 @@
+"""The centre spot: the bright dot on the middle line that anchors the line numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from wearline_reconstruct.core.stripes import Image, Scale
+
+_SHRINK = 4
+_LEAST_EXCESS = 0.4
+"""Light of the spot over that of its line on the same length, at least."""
+_LEAST_NOISE = 7.0
+"""And in robust standard deviations of that figure over the frame."""
+
+
+@dataclass(frozen=True)
+class Spot:
+    """Where the spot is on the strip image."""
+
+    along_px: float
+    across_px: float
+    excess: float
+    """Light beyond that of an ordinary piece of line, as a multiple of it."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """Part of the strip image where the spot may be. [px]"""
+
+    along_px: tuple[float, float]
+    across_px: tuple[float, float]
+
+
+def find_spots(strip: Image, scale: Scale, search: Search | None = None, most: int = 4) -> list[Spot]:
+    """Candidates for the centre spot, the strongest first.
+
+    The mean over a box one pitch high holds exactly one line wherever it lies, so that it is flat
+    over the pattern; what stands out compactly from it is the spot (or a glint).
+    """
+    pitch = scale.pitch_px if np.isfinite(scale.pitch_px) else 16.0 * scale.width_px
+    small = cv2.resize(strip, None, fx=1.0 / _SHRINK, fy=1.0 / _SHRINK, interpolation=cv2.INTER_AREA)
+    small = small.astype(np.float32)
+    unit = pitch / _SHRINK
+    period = max(int(round(unit)), 1)
+    length = max(int(round(max(0.35 * unit, 3.0))), 1)
+    light = cv2.blur(small, (period, length), borderType=cv2.BORDER_REFLECT_101)
+    size = int(round(2.6 * unit)) | 1
+    opened = cv2.morphologyEx(light, cv2.MORPH_OPEN, np.ones((size, size), np.uint8), borderType=cv2.BORDER_REPLICATE)
+    excess = light - cv2.blur(opened, (period, period))
+    ambient = cv2.erode(small, np.ones((1, period | 1), np.uint8))
+    line_light = float(np.percentile(light - cv2.blur(ambient, (period, length)), 70))
+    noise = float(np.median(np.abs(excess - np.median(excess)))) / 0.6745
+    least = max(_LEAST_EXCESS * line_light, _LEAST_NOISE * noise, 0.1)
+    allowed = np.zeros(excess.shape, np.uint8)
+    if search is None:
+        allowed[:] = 1
+    else:
+        a0, a1 = (int(v / _SHRINK) for v in search.along_px)
+        c0, c1 = (int(v / _SHRINK) for v in search.across_px)
+        allowed[max(a0, 0) : max(a1 + 1, 0), max(c0, 0) : max(c1 + 1, 0)] = 1
+    found: list[Spot] = []
+    for _ in range(most):
+        _, value, _, (across, along) = cv2.minMaxLoc(excess, allowed)
+        if value < least:
+            break
+        found.append(_located(strip, pitch, (along + 0.5) * _SHRINK, (across + 0.5) * _SHRINK, value / line_light))
+        reach = int(round(unit)) + 1
+        allowed[max(along - reach, 0) : along + reach + 1, max(across - reach, 0) : across + reach + 1] = 0
+    return found
+
+
+def _located(strip: Image, pitch: float, along: float, across: float, excess: float) -> Spot:
+    """The brightest blob near a coarse place, by the centroid of its squared light."""
+    for reach in (0.75 * pitch, 0.5 * pitch):
+        a0, c0 = max(int(along - reach), 0), max(int(across - reach), 0)
+        window = strip[a0 : int(along + reach) + 1, c0 : int(across + reach) + 1].astype(np.float32)
+        if window.size < 9:
+            break
+        window = cv2.GaussianBlur(window, (0, 0), max(pitch / 12.0, 1.0))
+        # What a line leaves without its spot: the lowest along the line.
+        window -= np.percentile(window, 25, axis=0)[None, :]
+        weight = np.maximum(window - 0.3 * float(window.max()), 0.0) ** 2
+        total = float(weight.sum())
+        if total <= 0.0:
+            break
+        along = a0 + float((weight.sum(axis=1) @ np.arange(weight.shape[0])) / total)
+        across = c0 + float((weight.sum(axis=0) @ np.arange(weight.shape[1])) / total)
+    return Spot(along, across, excess)
