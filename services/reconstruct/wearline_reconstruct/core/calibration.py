@@ -291,8 +291,8 @@ def _likeness_along(residual: F64) -> float:
 def _likeness(lines: int, is_used: Any, slope: float) -> list[F64]:
     """Per term a penalty on what departs from a cubic over the lines: one optic makes them all alike.
 
-    Position and direction of each line stay free, its bends and its sensitivity only as far as the
-    plates insist.
+    The position of each line stays free; its direction, bends and sensitivity depart only as far as
+    the plates insist.
     """
     number = np.linspace(-1.0, 1.0, lines)
     smooth = np.polynomial.chebyshev.chebvander(number, min(3, max(int(is_used.sum()) - 2, 0)))
@@ -300,10 +300,10 @@ def _likeness(lines: int, is_used: Any, slope: float) -> list[F64]:
     project = np.diag(is_used.astype(np.float64)) - smooth @ np.linalg.pinv(smooth)
     penalties = []
     for term in range(_X1_TERMS + _G_TERMS):
-        if term < 2:
+        if term == 0:
             penalties.append(np.zeros((lines, lines)))
         else:
-            allowed = 0.03 if term < _X1_TERMS else 0.001 * abs(slope)
+            allowed = (0.15 if term == 1 else 0.03) if term < _X1_TERMS else 0.001 * abs(slope)
             penalties.append(project / allowed**2)
     return penalties
 
