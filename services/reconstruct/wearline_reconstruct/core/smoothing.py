@@ -27,8 +27,6 @@ _WIDE = 1e6
 class SmoothingSettings(Settings):
     """How strongly heights are smoothed along a line."""
 
-    curvature_per_mm: float = 0.02
-    """Usual curvature of the surface along a line; the larger, the weaker the smoothing. [1/mm]"""
     gate_sigma: float = 4.5
     """A point further off the prediction than this many standard deviations does not enter."""
     overlap_px: int = 64
@@ -47,7 +45,7 @@ class Smoothed:
 
 
 def smooth(
-    z_mm: F64, sigma_mm: F64, starts: Bool, correlation_px: float, process_mm2: float, settings: SmoothingSettings
+    z_mm: F64, sigma_mm: F64, starts: Bool, correlation_px: float, process_mm2: F64, settings: SmoothingSettings
 ) -> Smoothed:
     """Smooth heights along the lines.
 
@@ -56,7 +54,7 @@ def smooth(
         sigma_mm: (line, along), standard uncertainty of one point. [mm]
         starts: (line, along), True at the first point of each piece without a break.
         correlation_px: points that share one independent error. [px]
-        process_mm2: variance that the slope gains per pixel. [mm^2/px^3]
+        process_mm2: (line, along), variance that the slope gains per pixel. [mm^2/px^3]
     """
     lines, size = z_mm.shape
     if not np.isfinite(z_mm).any():
@@ -67,12 +65,10 @@ def smooth(
     ends[:, :-1] = _next_start(starts, np.isfinite(z_mm))
     span = -(-size // _PIECES)
     run_in = min(settings.overlap_px, size)
-    forward = _lanes(z_mm, variance, starts, span, run_in)
-    backward = _lanes(z_mm[:, ::-1], variance[:, ::-1], ends[:, ::-1], span, run_in)
-    state = _filter(
-        *(np.concatenate([f, b], axis=1) for f, b in zip(forward, backward, strict=True)), process_mm2,
-        settings.gate_sigma**2, run_in,
-    )  # fmt: skip
+    forward = _lanes(z_mm, variance, process_mm2, starts, span, run_in)
+    backward = _lanes(z_mm[:, ::-1], variance[:, ::-1], process_mm2[:, ::-1], ends[:, ::-1], span, run_in)
+    both = (np.concatenate([f, b], axis=1) for f, b in zip(forward, backward, strict=True))
+    state = _filter(*both, gate=settings.gate_sigma**2, run_in=run_in)
     half = state.shape[2] // 2
     # Filtered from the left, predicted from the right: each point counts once.
     left = _whole(state[0:5, :, :half], lines, span, size)
@@ -91,7 +87,9 @@ def _next_start(starts: Bool, seen: Bool) -> Bool:
     return ends
 
 
-def _lanes(z: F64, variance: F64, starts: Bool, span: int, run_in: int) -> tuple[F64, F64, NDArray[np.bool_]]:
+def _lanes(
+    z: F64, variance: F64, process: F64, starts: Bool, span: int, run_in: int
+) -> tuple[F64, F64, F64, NDArray[np.bool_]]:
     """(run_in + span, line * piece): each piece with its run-in before it, time on the first axis."""
     lines, size = z.shape
     padded = _PIECES * span + run_in
@@ -102,10 +100,10 @@ def _lanes(z: F64, variance: F64, starts: Bool, span: int, run_in: int) -> tuple
         view = np.lib.stride_tricks.sliding_window_view(full, run_in + span, axis=1)[:, ::span][:, :_PIECES]
         return np.ascontiguousarray(view.reshape(lines * _PIECES, run_in + span).T)
 
-    return cut(z, np.nan), cut(variance, np.inf), cut(starts, False)  # type: ignore[return-value]
+    return cut(z, np.nan), cut(variance, np.inf), cut(process, 0.0), cut(starts, False)  # type: ignore[return-value]
 
 
-def _filter(z: F64, variance: F64, starts: Bool, process: float, gate: float, run_in: int) -> F64:
+def _filter(z: F64, variance: F64, process: F64, starts: Bool, *, gate: float, run_in: int) -> F64:
     """Filtered (z, slope, p00, p01, p11), then the same predicted: (10, span, lane)."""
     steps, lanes = z.shape
     out = np.empty((10, steps - run_in, lanes))
@@ -115,12 +113,12 @@ def _filter(z: F64, variance: F64, starts: Bool, process: float, gate: float, ru
     any_start = starts.any(axis=1)
     height, slope = np.zeros(lanes), np.zeros(lanes)
     p00, p01, p11 = np.full(lanes, _WIDE), np.zeros(lanes), np.full(lanes, 1.0)
-    q00, q01, q11 = process / 3.0, process / 2.0, process
     missed = np.zeros(lanes)
     for k in range(steps):
+        q11 = process[k]
         height = height + slope
-        p00 = p00 + 2.0 * p01 + p11 + q00
-        p01 = p01 + p11 + q01
+        p00 = p00 + 2.0 * p01 + p11 + q11 / 3.0
+        p01 = p01 + p11 + 0.5 * q11
         p11 = p11 + q11
         if any_start[k]:
             fresh = starts[k]

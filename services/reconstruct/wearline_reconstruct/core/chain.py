@@ -1,0 +1,394 @@
+"""The measuring chain: one frame to line points with an uncertainty each.
+
+A pure function of pixels, calibration, recipe and template: `prepare` does once what does not
+depend on the frame, `reconstruct` does the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from wearline.artifact import Calibration, Template
+from wearline.errors import CalibrationError, FrameError
+from wearline.messages import FrameQuality, ResultCode
+from wearline.recipe import Recipe
+from wearline_reconstruct.core.heights import across_at, height_slope, heights
+from wearline_reconstruct.core.lines import Fragments, LineSettings, fragments
+from wearline_reconstruct.core.numbering import (
+    NONE,
+    Gate,
+    NumberingSettings,
+    make_gate,
+    number_by_gate,
+    number_fragments,
+)
+from wearline_reconstruct.core.quality import check_pixels, check_stripes, describe
+from wearline_reconstruct.core.smoothing import SmoothingSettings, smooth
+from wearline_reconstruct.core.spot import Search, Spot, find_spots
+from wearline_reconstruct.core.stripes import (
+    F32,
+    F64,
+    I64,
+    Bool,
+    Image,
+    Scale,
+    StripeSettings,
+    stripe_peaks,
+    strip_image,
+)
+
+_STREAK_PX = 60.0
+"""Length of streaks of rolled sheet: points within it share the error that they cause. [px]"""
+
+
+@dataclass(frozen=True)
+class ChainSettings:
+    """Settings of all steps."""
+
+    stripes: StripeSettings = field(default_factory=StripeSettings)
+    lines: LineSettings = field(default_factory=LineSettings)
+    numbering: NumberingSettings = field(default_factory=NumberingSettings)
+    smoothing: SmoothingSettings = field(default_factory=SmoothingSettings)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What the frames of one object share."""
+
+    calibration: Calibration
+    recipe: Recipe
+    settings: ChainSettings
+    scale: Scale
+    gate: Gate | None
+    expected: Bool
+    """(line, along): where a point is expected."""
+    search: Search | None
+    """Where the spot may be; None = no spot at calibration."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What one frame showed."""
+
+    points: F32
+    """[n, 5]: line, row_px, col_px, z_mm, sigma_mm."""
+    sigma_frame_mm: float
+    coverage: float
+    quality: FrameQuality
+    timings_ms: dict[str, float]
+
+
+def pitch_of(calibration: Calibration) -> float:
+    """Usual distance of neighbouring lines. [px]"""
+    with np.errstate(invalid="ignore"):
+        gaps = np.diff(calibration.across0_px, axis=0)
+    finite = gaps[np.isfinite(gaps)]
+    return float(np.median(finite)) if len(finite) else float("inf")
+
+
+def prepare(
+    calibration: Calibration, recipe: Recipe, template: Template | None, settings: ChainSettings | None = None
+) -> Prepared:
+    """Gather what does not depend on the frame.
+
+    Raises:
+        CalibrationError: recipe and calibration disagree on the orientation, or there is no usable line.
+    """
+    settings = settings or ChainSettings()
+    if (recipe.orientation == "vertical") != calibration.is_vertical:
+        is_named = "orientation" in recipe.model_fields_set
+        if is_named:
+            raise CalibrationError(
+                f"is for {'vertical' if calibration.is_vertical else 'horizontal'} lines, the recipe for "
+                f"{recipe.orientation} ones", "calibration", "calibrate with the recipe's --orientation",
+            )  # fmt: skip
+    pitch = pitch_of(calibration)
+    if not np.isfinite(pitch) or pitch <= 0.0:
+        raise CalibrationError("has no two neighbouring lines", "calibration", "calibrate again")
+    scale = Scale(calibration.stripe_width_px, pitch)
+    along_size, across_size = _sizes(calibration)
+    gate = None
+    expected = np.isfinite(calibration.across0_px) & np.isfinite(calibration.a_mm_per_px)
+    if template is not None and template.line_across_px.shape == calibration.across0_px.shape:
+        gate = make_gate(
+            template.line_across_px, template.line_coverage, across_size, pitch, settings.numbering.gate_share
+        )
+        expected = expected & gate.expected
+    else:
+        low, high = calibration.z_range_mm
+        middle = across_at(calibration, 0.5 * (low + high))
+        with np.errstate(invalid="ignore"):
+            expected = expected & (middle >= 0) & (middle <= across_size - 1)
+    expected = expected & _within(recipe, calibration, expected.shape)
+    return Prepared(calibration, recipe, settings, scale, gate, expected, _spot_search(calibration, pitch))
+
+
+def _sizes(calibration: Calibration) -> tuple[int, int]:
+    """Pixels along and across the lines."""
+    rows, cols = (int(v) for v in calibration.image_shape)
+    return (rows, cols) if calibration.is_vertical else (cols, rows)
+
+
+def _within(recipe: Recipe, calibration: Calibration, shape: tuple[int, ...]) -> Bool:
+    """(line, along): inside the recipe's ROI at the datum."""
+    inside = np.ones(shape, bool)
+    if recipe.roi is None:
+        return inside
+    x, y, width, height = recipe.roi
+    along = np.arange(shape[1])
+    (a0, a1), (c0, c1) = ((y, y + height), (x, x + width)) if calibration.is_vertical else (
+        (x, x + width), (y, y + height)
+    )  # fmt: skip
+    across = across_at(calibration, float(np.mean(calibration.z_range_mm)))
+    with np.errstate(invalid="ignore"):
+        return inside & (along >= a0) & (along < a1) & (across >= c0) & (across < c1)
+
+
+def _spot_search(calibration: Calibration, pitch: float) -> Search | None:
+    spot = calibration.spot_px
+    if not np.isfinite(spot).all() or calibration.lines % 2 == 0:
+        return None
+    along = float(spot[0] if calibration.is_vertical else spot[1])
+    middle = calibration.lines // 2
+    place = int(np.clip(round(along), 0, calibration.across0_px.shape[1] - 1))
+    places = [float(across_at(calibration, float(z))[middle, place]) for z in calibration.z_range_mm]
+    if not np.isfinite(places).all():
+        return None
+    drift = max(abs(float(calibration.meta.get("spot_along_px_per_mm", 0.0)) * z) for z in calibration.z_range_mm)
+    # A part lower or higher than the range must be seen as such, not lost.
+    return Search(
+        (along - drift - pitch, along + drift + pitch), (min(places) - 1.2 * pitch, max(places) + 1.2 * pitch)
+    )
+
+
+def reconstruct(pixels: Image, prepared: Prepared, clock_s: Callable[[], float] | None = None) -> Reconstruction:
+    """Heights on the laser lines of one frame.
+
+    Args:
+        pixels: uint8 [row, col], the full sensor.
+        prepared: from `prepare`.
+        clock_s: a monotonic clock for `timings_ms`; None = no timings.
+
+    Raises:
+        FrameError: codes 21 (no picture of laser lines), 12 (too little of it) or 22 (out of range).
+    """
+    timings: dict[str, float] = {}
+    last = clock_s() if clock_s else 0.0
+
+    def lap(name: str) -> None:
+        nonlocal last
+        if clock_s:
+            now = clock_s()
+            timings[name] = round(1e3 * (now - last), 3)
+            last = now
+
+    calibration, settings = prepared.calibration, prepared.settings
+    rows, cols = (int(v) for v in calibration.image_shape)
+    check_pixels(pixels, (rows, cols))
+    strip = strip_image(pixels, calibration.is_vertical)
+    peaks = stripe_peaks(strip, prepared.scale, settings.stripes, prepared.recipe.method)
+    lap("stripes")
+    found = fragments(peaks, prepared.scale, settings.stripes.average_px, settings.lines)
+    check_stripes(found, peaks, int(prepared.expected.sum()))
+    lap("lines")
+    number, spot = _numbered(strip, found, prepared)
+    lap("numbering")
+    result = _measured(found, number, spot is not None, prepared)
+    lap("heights")
+    return Reconstruction(
+        result.points, result.sigma_frame_mm, result.coverage, result.quality, {**timings, "total": sum(timings.values())}
+    )
+
+
+def _numbered(strip: Image, found: Fragments, prepared: Prepared) -> tuple[I64, Spot | None]:
+    """Line number per peak, and the spot."""
+    calibration, pitch = prepared.calibration, prepared.scale.pitch_px
+    spots = find_spots(strip, prepared.scale, prepared.search) if prepared.search else []
+    if prepared.gate is not None:
+        number = number_by_gate(found, prepared.gate)
+        spot = _check_against_template(number, found, spots, prepared.gate, prepared)
+        return number, spot
+    numbers = number_fragments(
+        found, calibration, pitch, spots, prepared.recipe.line_constraints, prepared.settings.numbering
+    )
+    if not (numbers.number != NONE).any():
+        if prepared.search is not None and not spots:
+            raise FrameError(
+                "shows no centre spot, and nothing else settles the line numbers",
+                cure="uncover the spot, or mark lines with line_constraints in the recipe", code=int(ResultCode.COVERAGE),
+            )  # fmt: skip
+        low, high = calibration.z_range_mm
+        raise FrameError(
+            f"shows no line at a height between {low:.2f} and {high:.2f} mm that can be numbered for certain",
+            cure="check that the part lies in the calibrated range and that this is the calibrated head",
+            code=int(ResultCode.COVERAGE),
+        )  # fmt: skip
+    return numbers.number[found.label], spots[0] if spots else None
+
+
+def _check_against_template(
+    number: I64, found: Fragments, spots: list[Spot], gate: Gate, prepared: Prepared
+) -> Spot | None:
+    """A part one whole pitch too high passes any gate: spot and comb must fit as well.
+
+    Raises:
+        FrameError: they do not (22), or neither can be seen (12).
+    """
+    pitch = prepared.scale.pitch_px
+    for spot in spots:
+        place = int(np.clip(round(spot.along_px), 0, len(gate.middle_px) - 1))
+        near = gate.middle_px[max(place - int(pitch), 0) : place + int(pitch) + 1]
+        if not np.isfinite(near).any():
+            continue
+        off = spot.across_px - float(np.nanmedian(near))
+        if abs(off) < 0.55 * pitch:
+            return spot
+        if spot.excess > 1.0:
+            raise FrameError(
+                f"shows the centre spot {abs(off) / pitch:.1f} line distances from where the template has it",
+                cure="check the part's position and that the template belongs to it", code=int(ResultCode.REGISTRATION),
+            )  # fmt: skip
+    per_line = gate.expected.sum(axis=1)
+    used = np.flatnonzero(per_line > 0.25 * gate.expected.shape[1])
+    seen = np.bincount(number[number != NONE], minlength=len(per_line))
+    unclaimed = int((number == NONE).sum())
+    if len(used) and unclaimed < 0.5 * per_line[used].mean():
+        ends = used[[0, -1]]
+        if (seen[ends] > 0.6 * per_line[ends]).all():
+            return None
+    raise FrameError(
+        "shows no centre spot, and the lines alone do not settle their numbers",
+        cure="uncover the spot and check the part's position", code=int(ResultCode.COVERAGE),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Measured:
+    points: F32
+    sigma_frame_mm: float
+    coverage: float
+    quality: FrameQuality
+
+
+def _measured(found: Fragments, number: I64, spot_found: bool, prepared: Prepared) -> _Measured:
+    calibration, recipe = prepared.calibration, prepared.recipe
+    lines, along_size = calibration.across0_px.shape
+    keep = np.flatnonzero(number != NONE)
+    keep = keep[_one_each(number[keep], found, keep, along_size)]
+    line, along = number[keep], found.peaks.along[keep].astype(np.int64)
+    across = found.peaks.across_px[keep].astype(np.float64)
+    z = heights(calibration, line, along, across)
+    low, high = calibration.z_range_mm
+    with np.errstate(invalid="ignore"):
+        valid = (z >= low) & (z <= high)
+    if valid.mean() < 0.2:
+        raise FrameError(
+            f"lies at {float(np.nanmedian(z)):.2f} mm, outside the calibrated {low:.2f} to {high:.2f} mm",
+            cure="check the part's position or calibrate a larger range", code=int(ResultCode.REGISTRATION),
+        )  # fmt: skip
+    keep, line, along, across, z = keep[valid], line[valid], along[valid], across[valid], z[valid]
+    slope = np.abs(height_slope(calibration, line, along, across))
+    texture = _texture_px(found, keep, prepared)
+    fast = found.sigma_px[keep].astype(np.float64)
+
+    grid_z = np.full((lines, along_size), np.nan)
+    grid_sigma = np.full((lines, along_size), np.nan)
+    label = np.full((lines, along_size), -1, np.int64)
+    grid_z[line, along] = z
+    length = max(found.correlation_px, 1.0)
+    long_run = np.sqrt(fast**2 * length + texture**2 * _STREAK_PX)
+    grid_sigma[line, along] = slope * long_run
+    label[line, along] = found.label[keep]
+    starts = _piece_starts(label, grid_z)
+    process = _process_noise(grid_z, slope, fast, length, grid_sigma)
+    smoothed = smooth(grid_z, grid_sigma, starts, 1.0, process, prepared.settings.smoothing)
+    z = smoothed.z_mm[line, along]
+    posterior = np.minimum(smoothed.sigma_mm[line, along], slope * np.sqrt(fast**2 + texture**2))
+    vibration = float(calibration.meta.get("vibration_px", 0.05)) * float(np.median(slope)) if len(slope) else 0.0
+    common = float(np.hypot(vibration, float(calibration.meta.get("z_sigma_common_mm", 0.0))))
+    sigma = np.sqrt(posterior**2 + calibration.z_sigma_mm[line, along] ** 2 + vibration**2)
+    good = np.isfinite(z) & np.isfinite(sigma) & ~smoothed.is_rejected[line, along]
+    if recipe.roi is not None:
+        x, y, width, height = recipe.roi
+        row, col = (along, across) if calibration.is_vertical else (across, along)
+        good &= (col >= x) & (col < x + width) & (row >= y) & (row < y + height)
+    order = np.flatnonzero(good)
+    order = order[np.lexsort((along[order], line[order]))]
+    row, col = (along, across) if calibration.is_vertical else (across, along)
+    points = np.stack([line[order], row[order], col[order], z[order], sigma[order]], axis=1).astype(np.float32)
+    expected = prepared.expected
+    hit = np.zeros_like(expected)
+    hit[line[order], along[order]] = True
+    coverage = float((hit & expected).sum() / max(int(expected.sum()), 1))
+    if not len(points):
+        raise FrameError(
+            "shows no measurable point in the region of interest", cure="check the recipe's roi and the part",
+            code=int(ResultCode.COVERAGE),
+        )  # fmt: skip
+    seen = len(np.unique(line[order]))
+    wanted = int((expected.sum(axis=1) > 0.1 * along_size).sum())
+    quality = describe(found, seen, max(wanted, seen), spot_found, calibration.stripe_width_px, coverage)
+    return _Measured(points, common, coverage, quality)
+
+
+def _one_each(number: I64, found: Fragments, keep: I64, along_size: int) -> I64:
+    """Indices into ``keep``: where two peaks claim one place of a line, the stronger."""
+    place = number * along_size + found.peaks.along[keep]
+    order = np.lexsort((-found.peaks.signal_dn[keep], place))
+    ordered = place[order]
+    first = np.ones(len(order), bool)
+    first[1:] = ordered[1:] != ordered[:-1]
+    return np.sort(order[first])
+
+
+def _texture_px(found: Fragments, keep: I64, prepared: Prepared) -> F64:
+    """Error of each position by the surface's streaks: that of the calibration's plates, and more in ambient light. [px]"""
+    meta = prepared.calibration.meta
+    gain = 2.0 * prepared.scale.width_px
+    base = float(meta.get("texture_px", 0.0))
+    ambient_then = gain * float(meta.get("noise_dn", 0.0)) / max(float(meta.get("signal_dn", 1.0)), 1.0)
+    steady = np.sqrt(max(base**2 - ambient_then**2, 0.0))
+    signal = np.maximum(found.peaks.signal_dn[keep].astype(np.float64), 1.0)
+    return np.asarray(np.hypot(steady, gain * found.peaks.noise_dn / signal))
+
+
+def _piece_starts(label: I64, z: F64) -> Bool:
+    """(line, along): first point of each piece that the smoother may not cross."""
+    starts = np.zeros(label.shape, bool)
+    for line in range(label.shape[0]):
+        places = np.flatnonzero(np.isfinite(z[line]))
+        if len(places):
+            owner = label[line, places]
+            fresh = np.ones(len(places), bool)
+            fresh[1:] = (owner[1:] != owner[:-1]) | (np.diff(places) > 40)
+            starts[line, places[fresh]] = True
+    return starts
+
+
+_LAG = 16
+_LONGEST_PX = 40.0
+
+
+def _process_noise(z: F64, slope: F64, fast: F64, length: float, sigma: F64) -> F64:
+    """Variance that the slope gains per pixel, (line, along), from the surface's own third differences. [mm^2/px^3]"""
+    usual = float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else 0.0
+    least = usual**2 / _LONGEST_PX**4
+    process = np.full(z.shape, least)
+    if z.shape[1] <= 4 * _LAG:
+        return process
+    third = z[:, 3 * _LAG :] - 3.0 * z[:, 2 * _LAG : -_LAG] + 3.0 * z[:, _LAG : -2 * _LAG] - z[:, : -3 * _LAG]
+    noise = 20.0 * float(np.median((slope * fast) ** 2))
+    squared = np.where(np.isfinite(third), third * third, 0.0).astype(np.float32)
+    have = np.isfinite(third).astype(np.float32)
+    window = (3 * _LAG + 1, 1)
+    mean = cv2.blur(squared, window) / np.maximum(cv2.blur(have, window), 1e-3)
+    excess = np.maximum(mean - 1.5 * noise, 0.0) / _LAG**3
+    start = 3 * _LAG // 2
+    process[:, start : start + excess.shape[1]] += excess
+    process[:, :start] += excess[:, :1]
+    process[:, start + excess.shape[1] :] += excess[:, -1:]
+    return process

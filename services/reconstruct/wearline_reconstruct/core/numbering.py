@@ -1,0 +1,308 @@
+"""Absolute line numbers: which projected line each fragment belongs to.
+
+In inspection the template says where each line is expected, and a point within just under half a
+pitch of it is that line (`Gate`). Without a template the fragments are numbered by the most
+probable assignment (`number_fragments`): every fragment may bear the numbers whose heights lie in
+the calibrated range, or none; neighbours across the lines keep their order, count up by one unless
+a line is missing between them, and rather lie at like heights; pieces that follow each other along
+a line rather go on at the same height; the spot and corrections by hand are fixed. Minimum-sum
+belief propagation on this graph gives each fragment its number and the margin to the next best;
+what is not clearly ahead stays without a number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wearline.artifact import Calibration
+from wearline.config import Settings
+from wearline.recipe import LineConstraint
+from wearline_reconstruct.core.lines import Fragments
+from wearline_reconstruct.core.spot import Spot
+from wearline_reconstruct.core.stripes import F32, F64, I64, Bool
+
+NONE = -1
+_NEVER = 1e4
+_COLUMN_STEP = 4
+_MOST_FRAGMENTS = 400
+
+
+class NumberingSettings(Settings):
+    """How sure a line number must be."""
+
+    gate_share: float = 0.48
+    """In inspection, a point within this share of the pitch from the template's line is that line."""
+    least_margin: float = 2.0
+    """Cost by which the best number must lead; 1 = a height difference of one pitch over four columns."""
+
+
+@dataclass(frozen=True)
+class Gate:
+    """Where the template expects which line."""
+
+    image: NDArray[np.uint8]
+    """[along, across]: line number, 255 = none."""
+    middle_px: F32
+    """[along]: expected place of the middle line, NaN = not seen. [px]"""
+    expected: Bool
+    """(line, along): the template has a point."""
+
+
+def make_gate(line_across_px: F32, coverage: F32, across_size: int, pitch_px: float, share: float) -> Gate:
+    """Build the look-up image of a template: (line, along) places and their coverage."""
+    lines, along_size = line_across_px.shape
+    across = np.where(coverage >= 0.5, line_across_px, np.nan).astype(np.float64)
+    image = np.full((along_size, across_size), 255, np.uint8)
+    reach = np.full(across.shape, share * pitch_px)
+    gap = np.diff(across, axis=0)
+    with np.errstate(invalid="ignore"):
+        reach[1:] = np.where(np.isfinite(gap), np.minimum(reach[1:], 0.5 * gap), reach[1:])
+        reach[:-1] = np.where(np.isfinite(gap), np.minimum(reach[:-1], 0.5 * gap), reach[:-1])
+    for line in range(lines):
+        columns = np.flatnonzero(np.isfinite(across[line]))
+        if not len(columns):
+            continue
+        low = np.ceil(across[line, columns] - reach[line, columns]).astype(np.int64)
+        high = np.floor(across[line, columns] + reach[line, columns]).astype(np.int64)
+        offset = np.arange(int((high - low).max()) + 1)
+        place = low[:, None] + offset
+        inside = (place <= high[:, None]) & (place >= 0) & (place < across_size)
+        image[np.broadcast_to(columns[:, None], place.shape)[inside], place[inside]] = line
+    return Gate(image, across[lines // 2].astype(np.float32), np.isfinite(across))
+
+
+def number_by_gate(found: Fragments, gate: Gate) -> I64:
+    """Line number per peak; `NONE` where the template expects no line."""
+    across = np.clip(np.rint(found.peaks.across_px), 0, gate.image.shape[1] - 1).astype(np.int64)
+    number = gate.image[found.peaks.along, across].astype(np.int64)
+    return np.where(number == 255, NONE, number)
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Numbers of fragments, [fragment]."""
+
+    number: I64
+    """`NONE` where nothing settles it."""
+    margin: F64
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    first: I64
+    second: I64
+    cost: F64
+    """[pair, label of first, label of second]"""
+
+
+def number_fragments(
+    found: Fragments,
+    calibration: Calibration,
+    pitch_px: float,
+    spots: list[Spot],
+    constraints: tuple[LineConstraint, ...],
+    settings: NumberingSettings,
+) -> Numbers:
+    """Number the fragments of a frame without a template."""
+    count = found.count
+    number, margin = np.full(count, NONE), np.zeros(count)
+    if count == 0:
+        return Numbers(number, margin)
+    size = np.bincount(found.label)
+    chosen = np.sort(np.argsort(-size, kind="stable")[:_MOST_FRAGMENTS])
+    index_of = np.full(count, -1)
+    index_of[chosen] = np.arange(len(chosen))
+    node = index_of[found.label]
+    use = node >= 0
+    along = found.peaks.along[use].astype(np.int64)
+    across = found.peaks.across_px[use].astype(np.float64)
+    node = node[use]
+    d = across - calibration.across0_px[:, along]
+    z = calibration.a_mm_per_px[:, along] * d / (1.0 + calibration.b_per_px * d)
+    step_mm = float(np.nanmedian(np.abs(calibration.a_mm_per_px))) * pitch_px
+    low, high = calibration.z_range_mm
+    with np.errstate(invalid="ignore"):
+        fits = (z >= low) & (z <= high)
+    total = np.bincount(node, minlength=len(chosen))
+    share = np.stack([np.bincount(node, weights=f, minlength=len(chosen)) for f in fits], axis=1) / total[:, None]
+    labels = calibration.lines + 1
+    unary = np.full((len(chosen), labels), _NEVER)
+    unary[:, :-1] = np.where(share >= 0.7, 4.0 * (1.0 - share), _NEVER)
+    signal = found.peaks.signal_dn[use]
+    usual = float(np.median(signal))
+    strength = np.bincount(node, weights=signal, minlength=len(chosen)) / total / max(usual, 1e-6)
+    unary[:, -1] = 0.6 * total / _COLUMN_STEP * np.clip(strength, 0.15, 1.0) + 0.5
+    _fix(unary, along, across, node, pitch_px, spots, constraints, calibration)
+    pairs = _neighbours_across(node, along, across, z, step_mm, labels, len(chosen))
+    follow = _neighbours_along(node, along, across, z, step_mm, pitch_px, labels, len(chosen))
+    best, lead = _propagate(unary, [pairs, follow])
+    settled = (best < calibration.lines) & (lead >= settings.least_margin)
+    settled &= unary[np.arange(len(chosen)), best] < _NEVER
+    result = np.where(settled, best, NONE)
+    result = _ordered(result, lead, node, along, across)
+    number[chosen] = result
+    margin[chosen] = lead
+    return Numbers(number, margin)
+
+
+def _fix(
+    unary: F64, along: I64, across: F64, node: I64, pitch_px: float, spots: list[Spot],
+    constraints: tuple[LineConstraint, ...], calibration: Calibration,
+) -> None:  # fmt: skip
+    """Enter the spot and the corrections by hand."""
+    middle = calibration.lines // 2
+    for spot in spots[:1]:
+        nearest = _nearest_node(along, across, node, spot.along_px, spot.across_px, pitch_px)
+        if nearest is not None and unary[nearest, middle] < _NEVER:
+            keep = unary[nearest, middle]
+            # Strong, not absolute: a reflection that passes for the spot must not outweigh the whole comb.
+            unary[nearest] += 150.0
+            unary[nearest, middle] = keep
+    for constraint in constraints:
+        if constraint.line >= calibration.lines:
+            continue
+        place = (constraint.row_px, constraint.col_px)
+        at, over = place if calibration.is_vertical else place[::-1]
+        nearest = _nearest_node(along, across, node, at, over, pitch_px)
+        if nearest is not None:
+            unary[nearest] = _NEVER
+            unary[nearest, constraint.line] = 0.0
+
+
+def _nearest_node(along: I64, across: F64, node: I64, at: float, over: float, pitch_px: float) -> int | None:
+    near = np.flatnonzero(np.abs(along - at) < 0.75 * pitch_px)
+    if not len(near):
+        return None
+    distance = np.hypot(across[near] - over, 0.3 * (along[near] - at))
+    best = int(np.argmin(distance))
+    return int(node[near[best]]) if distance[best] < 0.4 * pitch_px else None
+
+
+def _neighbours_across(
+    node: I64, along: I64, across: F64, z: F64, step_mm: float, labels: int, count: int
+) -> _Pairs:
+    """Fragments that are neighbours in a cross section: order, missing lines, like heights."""
+    column = along % _COLUMN_STEP == 0
+    index = np.flatnonzero(column)
+    index = index[np.lexsort((across[index], along[index]))]
+    firsts, seconds, costs = [], [], []
+    order = np.arange(labels - 1)
+    missing = order[None, :] - order[:, None] - 1
+    gap_cost = np.where(missing < 0, _NEVER, np.where(missing == 0, 0.0, 0.6 + 0.25 * (missing - 1.0)))
+    for reach in (1, 2):
+        upper, lower = index[:-reach], index[reach:]
+        same = (along[upper] == along[lower]) & (node[upper] != node[lower])
+        upper, lower = upper[same], lower[same]
+        if not len(upper):
+            continue
+        key, inverse, weight = np.unique(
+            node[upper] * count + node[lower], return_inverse=True, return_counts=True
+        )
+        cost = np.zeros((len(key), labels, labels))
+        if reach == 1:
+            jump = _mean_jump(z, upper, lower, inverse, len(key)) / step_mm
+            cost[:, :-1, :-1] = (jump + gap_cost) * np.minimum(weight, 60)[:, None, None]
+        else:
+            cost[:, :-1, :-1] = np.where(missing < 0, _NEVER, 0.0)
+        # One column may be a crossing of noise; it must not forbid anything for ever.
+        cost = np.minimum(cost, np.where(weight >= 2, _NEVER, 4.0)[:, None, None])
+        firsts.append(key // count)
+        seconds.append(key % count)
+        costs.append(cost)
+    return _joined(firsts, seconds, costs, labels)
+
+
+def _mean_jump(z: F64, upper: I64, lower: I64, pair: I64, pairs: int) -> F64:
+    """[pair, label above, label below]: mean size of the height difference, from means over both sides. [mm]"""
+    weight = np.bincount(pair, minlength=pairs)
+    above = np.stack([np.bincount(pair, weights=np.nan_to_num(row[upper], nan=1e3), minlength=pairs) for row in z], 1)
+    below = np.stack([np.bincount(pair, weights=np.nan_to_num(row[lower], nan=1e3), minlength=pairs) for row in z], 1)
+    above, below = above / weight[:, None], below / weight[:, None]
+    return np.abs(above[:, :, None] - below[:, None, :]).clip(0.0, 1e3)
+
+
+def _neighbours_along(
+    node: I64, along: I64, across: F64, z: F64, step_mm: float, pitch_px: float, labels: int, count: int
+) -> _Pairs:
+    """Fragments that follow each other along the lines: the surface rather goes on at its height."""
+    order = np.lexsort((along, node))
+    first = order[np.searchsorted(node[order], np.arange(count))]
+    last = order[np.searchsorted(node[order], np.arange(count), side="right") - 1]
+    firsts, seconds, costs = [], [], []
+    reach = 4.0 * pitch_px
+    for source in range(count):
+        end = last[source]
+        gap = along[first] - along[end]
+        drift = np.abs(across[first] - across[end])
+        near = np.flatnonzero((gap > 0) & (gap < reach) & (drift < 1.3 * pitch_px))
+        near = near[np.argsort(gap[near] + drift[near])[:3]]
+        for target in near:
+            jump = np.abs(z[:, end][:, None] - z[:, first[target]][None, :]) / step_mm
+            cost = np.zeros((labels, labels))
+            strength = 3.0 * (1.0 - gap[target] / reach)
+            cost[:-1, :-1] = strength * np.minimum(np.nan_to_num(jump, nan=1.0), 1.0)
+            firsts.append(source)
+            seconds.append(int(target))
+            costs.append(cost[None])
+    return _joined([np.array(firsts, np.int64)], [np.array(seconds, np.int64)], costs, labels)
+
+
+def _joined(firsts: list[I64], seconds: list[I64], costs: list[F64], labels: int) -> _Pairs:
+    if not costs:
+        return _Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, labels, labels)))
+    return _Pairs(np.concatenate(firsts), np.concatenate(seconds), np.concatenate(costs))
+
+
+def _propagate(unary: F64, groups: list[_Pairs], turns: int = 60) -> tuple[I64, F64]:
+    """Minimum-sum belief propagation: best label per node and its lead over the second best."""
+    first = np.concatenate([g.first for g in groups])
+    second = np.concatenate([g.second for g in groups])
+    cost = np.minimum(np.concatenate([g.cost for g in groups]), _NEVER).astype(np.float32)
+    source = np.concatenate([first, second])
+    target = np.concatenate([second, first])
+    # Cost as seen by each directed message: [message, label of source, label of target].
+    towards = np.concatenate([cost, cost.transpose(0, 2, 1)])
+    count, labels = unary.shape
+    edges = len(first)
+    reverse = np.concatenate([np.arange(edges, 2 * edges), np.arange(edges)])
+    message = np.zeros((2 * edges, labels), np.float32)
+    own = unary.astype(np.float32)
+    belief = own.copy()
+    for turn in range(turns):
+        if not edges:
+            break
+        outgoing = belief[source] - message[reverse]
+        fresh = (outgoing[:, :, None] + towards).min(axis=1)
+        fresh -= fresh.min(axis=1, keepdims=True)
+        np.minimum(fresh, _NEVER, out=fresh)
+        # Damping keeps loops from swinging.
+        fresh = fresh if turn == 0 else 0.5 * fresh + 0.5 * message
+        change = float(np.abs(fresh - message).max())
+        message = fresh
+        belief = own.copy()
+        np.add.at(belief, target, message)
+        if change < 1e-2:
+            break
+    ranked = np.sort(belief, axis=1)
+    return np.argmin(belief, axis=1).astype(np.int64), (ranked[:, 1] - ranked[:, 0]).astype(np.float64)
+
+
+def _ordered(number: I64, lead: F64, node: I64, along: I64, across: F64) -> I64:
+    """Withdraw numbers that stand in the wrong order in some cross section; the less certain one goes."""
+    number = number.copy()
+    for _ in range(len(number)):
+        kept = np.flatnonzero(number[node] != NONE)
+        index = kept[np.lexsort((across[kept], along[kept]))]
+        upper, lower = index[:-1], index[1:]
+        wrong = (along[upper] == along[lower]) & (number[node[lower]] <= number[node[upper]])
+        if not wrong.any():
+            break
+        pair, weight = np.unique(
+            np.stack([node[upper[wrong]], node[lower[wrong]]]), axis=1, return_counts=True
+        )
+        a, b = pair[:, int(np.argmax(weight))]
+        number[a if lead[a] < lead[b] else b] = NONE
+    return number
