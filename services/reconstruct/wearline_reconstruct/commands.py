@@ -1,0 +1,276 @@
+"""``wearline calibrate``, ``wearline reconstruct`` and ``wearline bench``."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from wearline.artifact import Calibration, Template
+from wearline.cli import Command, progress
+from wearline.errors import CalibrationError, FrameError, UsageError
+from wearline.messages import LinePoints
+from wearline.offline import Chain, read_frame
+from wearline.recipe import Recipe, load_recipe
+from wearline.surface import dense_map
+from wearline_reconstruct.config import ReconstructSettings
+from wearline_reconstruct.core.calibration import Shot, calibrate
+from wearline_reconstruct.core.chain import prepare
+from wearline_reconstruct.core.lines import Fragments, fragments
+from wearline_reconstruct.core.stripes import estimate_scale, strip_image, stripe_peaks
+from wearline_reconstruct.drivers.pictures import read_picture
+
+
+def _configure_calibrate(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--plane", action="append", default=[], metavar="HEIGHT=FILE",
+        help="picture of a flat plate at this height [mm]; two heights at least, several per height are welcome",
+    )  # fmt: skip
+    parser.add_argument("--lines", type=int, default=25, help="lines that the laser projects (default 25)")
+    scale = parser.add_mutually_exclusive_group()
+    scale.add_argument("--mm-per-pixel", type=float, metavar="S", help="lateral scale on the plane z = 0 [mm/px]")
+    scale.add_argument("--target", type=Path, metavar="BOARD.png", help="picture of a chessboard on the plane z = 0")
+    parser.add_argument("--square-mm", type=float, metavar="MM", help="edge of one field of the chessboard [mm]")
+    parser.add_argument("--orientation", choices=("horizontal", "vertical"), default="horizontal")
+    parser.add_argument("--out", type=Path, required=True, metavar="C.npz")
+
+
+def _run_calibrate(arguments: Namespace) -> int:
+    cv2.setNumThreads(1)
+    if arguments.lines < 3:
+        raise UsageError(f"{arguments.lines} lines are too few", "--lines", "give 3 or more")
+    if arguments.mm_per_pixel is not None and not 0.0 < arguments.mm_per_pixel < 10.0:
+        raise UsageError(f"{arguments.mm_per_pixel:g} mm per pixel cannot be", "--mm-per-pixel", "give mm of one pixel")
+    planes = [_plane(text) for text in arguments.plane]
+    if len({height for height, _ in planes}) < 2:
+        raise UsageError("needs plates at two heights at least", "--plane", "give --plane HEIGHT=FILE for each")
+    _check_writable(arguments.out)
+    scale = arguments.mm_per_pixel
+    if arguments.target is not None:
+        scale = _target_scale(arguments.target, arguments.square_mm)
+    elif arguments.square_mm is not None:
+        raise UsageError("goes with --target", "--square-mm", "name the picture of the chessboard")
+    settings = ReconstructSettings()
+    shots = [Shot(height, read_frame(path), str(path)) for height, path in progress(planes, "read")]
+    calibration = calibrate(
+        shots, lines=arguments.lines, is_vertical=arguments.orientation == "vertical", mm_per_pixel=scale,
+        settings=settings.calibration, stripes=settings.stripes, line_settings=settings.lines,
+    )  # fmt: skip
+    name = calibration.save(arguments.out)
+    _report(calibration, arguments.out, name)
+    return 0
+
+
+def _plane(text: str) -> tuple[float, Path]:
+    height, found, path = text.partition("=")
+    try:
+        value = float(height)
+    except ValueError:
+        found = ""
+    if not found or not path or not np.isfinite(value):
+        raise UsageError(f"'{text}' is not HEIGHT=FILE", "--plane", "write for example --plane 3=P3.png")
+    return value, Path(path)
+
+
+def _check_writable(path: Path) -> None:
+    if path.is_dir() or not path.parent.is_dir():
+        raise UsageError("is a folder" if path.is_dir() else "lies in no folder", f"--out {path}", "name a file to write")
+
+
+def _target_scale(path: Path, square_mm: float | None) -> float:
+    """mm per pixel about the middle of a chessboard.
+
+    Raises:
+        UsageError: the size of the fields is missing.
+        CalibrationError: there is no chessboard.
+    """
+    if square_mm is None or square_mm <= 0.0:
+        raise UsageError("needs the size of the chessboard's fields", "--target", "add --square-mm MM")
+    picture = read_picture(path)
+    grey = picture if picture.dtype == np.uint8 else np.clip(picture, 0, 255).astype(np.uint8)
+    found, corners, meta = cv2.findChessboardCornersSBWithMeta(
+        grey, (3, 3), cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
+    )
+    if not found or meta is None:
+        raise CalibrationError("shows no chessboard", str(path), "show all of it, flat on z = 0, sharp, laser off")
+    grid = corners.reshape(meta.shape[0], meta.shape[1], 2)
+    steps = np.concatenate(
+        [np.linalg.norm(np.diff(grid, axis=axis), axis=2).reshape(-1) for axis in (0, 1)]
+    )
+    return float(square_mm / np.median(steps))
+
+
+def _report(calibration: Calibration, path: Path, name: str) -> None:
+    low, high = calibration.z_range_mm
+    covered = np.isfinite(calibration.across0_px).mean()
+    print(f"{path}: {name[:12]}, {calibration.lines} lines, {covered:.0%} covered")
+    for shot in calibration.meta["shots"]:
+        print(
+            f"  {shot['z_mm']:8.3f} mm  {shot['where']}: {shot['lines']} lines, offset {1e3 * shot['offset_mm']:+.1f} um,"
+            f" rest {1e3 * shot['rms_mm']:.1f} um per point"
+        )
+    print(
+        f"  heights {low:.2f} to {high:.2f} mm, {1e3 * abs(calibration.meta['mm_per_line_px']):.1f} um per px of line"
+        f" shift, calibration uncertainty {1e3 * float(np.nanmedian(calibration.z_sigma_mm)):.1f} um,"
+        f" vibration {calibration.meta['vibration_px']:.3f} px"
+    )
+
+
+def _configure_reconstruct(parser: ArgumentParser) -> None:
+    parser.add_argument("frames", nargs="*", type=Path, metavar="FRAME.png")
+    parser.add_argument("--calibration", type=Path, metavar="C.npz")
+    parser.add_argument("--recipe", type=Path, metavar="R.yaml")
+    parser.add_argument("--template", type=Path, metavar="T.npz", help="gates the line numbers")
+    parser.add_argument("--stripes-only", action="store_true", help="only find the stripes; needs no calibration")
+    parser.add_argument("--orientation", choices=("horizontal", "vertical"), help="with --stripes-only")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+
+
+def _run_reconstruct(arguments: Namespace) -> int:
+    cv2.setNumThreads(1)
+    frames: list[Path] = arguments.frames
+    if not frames:
+        raise UsageError("no frame was named", "reconstruct", "name one or more image files")
+    stems: dict[str, Path] = {}
+    for frame in frames:
+        if frame.stem in stems:
+            raise UsageError(
+                f"{stems[frame.stem]} and {frame} would both be written to {frame.stem}.npz", "reconstruct",
+                "rename one, or give them an --out each",
+            )  # fmt: skip
+        stems[frame.stem] = frame
+    if arguments.out.exists() and not arguments.out.is_dir():
+        raise UsageError("is no folder", f"--out {arguments.out}", "name a folder")
+    if arguments.stripes_only:
+        if arguments.calibration or arguments.template or arguments.recipe:
+            raise UsageError("needs no calibration, template or recipe", "--stripes-only", "leave them out")
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        return _stripes_only(frames, arguments.orientation == "vertical", arguments.out)
+    if arguments.calibration is None:
+        raise UsageError("is missing", "--calibration", "name a calibration, or look at --stripes-only")
+    if arguments.orientation is not None:
+        raise UsageError("goes with --stripes-only", "--orientation", "the calibration knows it")
+    recipe = load_recipe(arguments.recipe)
+    calibration = Calibration.load(arguments.calibration)
+    template = Template.load(arguments.template) if arguments.template else None
+    prepare(calibration, recipe, template)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    return _heights(frames, recipe, calibration, template, arguments.out)
+
+
+def _heights(
+    frames: Sequence[Path], recipe: Recipe, calibration: Calibration, template: Template | None, out: Path
+) -> int:
+    chain = Chain(recipe, calibration, template)
+    try:
+        for path in progress(frames, "reconstruct"):
+            start = time.perf_counter()
+            try:
+                pixels = read_frame(path)
+            except FrameError as error:
+                print(f"wearline: {error}", file=sys.stderr)
+                continue
+            decoded = time.perf_counter()
+            found = chain.line_points(pixels)
+            if found.refusal_code:
+                print(f"wearline: {path}: {found.refusal}", file=sys.stderr)
+                continue
+            _save_heights(out / f"{path.stem}.npz", found, calibration, recipe, 1e3 * (decoded - start))
+            print(f"{path}: {len(found.points)} points, coverage {found.coverage:.3f}, {out / path.stem}.npz")
+    finally:
+        chain.close()
+    return 0
+
+
+def _save_heights(
+    path: Path, found: LinePoints, calibration: Calibration, recipe: Recipe, decode_ms: float
+) -> None:
+    start = time.perf_counter()
+    rows, cols = (int(v) for v in calibration.image_shape)
+    surface = dense_map(
+        np.asarray(found.points), (rows, cols), is_vertical=calibration.is_vertical, roi=_clipped(recipe.roi, rows, cols)
+    )
+    timings = {"decode": round(decode_ms, 3), **found.timings_ms, "map": round(1e3 * (time.perf_counter() - start), 3)}
+    points = found.points
+    np.savez_compressed(
+        path, line=points[:, 0].astype(np.int16), row_px=points[:, 1], col_px=points[:, 2], z_mm=points[:, 3],
+        sigma_mm=points[:, 4], sigma_frame_mm=np.float64(found.sigma_frame_mm), z_map_mm=surface.z_mm,
+        sigma_map_mm=surface.sigma_mm, roi=surface.roi, coverage=np.float64(found.coverage),
+        timings_ms=np.array(json.dumps(timings)),
+    )  # fmt: skip
+
+
+def _clipped(roi: tuple[int, int, int, int] | None, rows: int, cols: int) -> tuple[int, int, int, int] | None:
+    if roi is None:
+        return None
+    x, y, width, height = roi
+    x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + width, cols), min(y + height, rows)
+    if x1 <= x0 or y1 <= y0:
+        raise UsageError(f"roi {roi} lies outside the {cols} x {rows} sensor", "recipe", "give x, y, width, height in px")
+    return x0, y0, x1 - x0, y1 - y0
+
+
+def _stripes_only(frames: Sequence[Path], is_vertical: bool, out: Path) -> int:
+    settings = ReconstructSettings()
+    for path in progress(frames, "stripes"):
+        try:
+            picture = read_picture(path)
+        except FrameError as error:
+            print(f"wearline: {error}", file=sys.stderr)
+            continue
+        strip = strip_image(picture, is_vertical)
+        scale = estimate_scale(strip)
+        peaks = stripe_peaks(strip, scale, settings.stripes)
+        found = fragments(peaks, scale, settings.stripes.average_px, settings.lines)
+        if not found.count:
+            print(f"wearline: {path}: shows no stripes; check --orientation and exposure", file=sys.stderr)
+            continue
+        across, along = found.peaks.across_px, found.peaks.along.astype(np.float32)
+        row, col = (along, across) if is_vertical else (across, along)
+        np.savez_compressed(
+            out / f"{path.stem}.npz", row_px=row, col_px=col, sigma_px=found.sigma_px, stripe=found.label.astype(np.int32)
+        )
+        cv2.imwrite(str(out / f"{path.stem}_stripes.png"), _drawn(picture, found, row, col))
+        print(f"{path}: {found.count} stripes, {len(row)} points, width {scale.width_px:.1f} px")
+    return 0
+
+
+def _drawn(picture: NDArray[Any], found: Fragments, row: NDArray[np.float32], col: NDArray[np.float32]) -> NDArray[Any]:
+    """The picture with each fragment in a colour of its own."""
+    grey = np.clip(picture.astype(np.float32) * 0.75, 0, 255).astype(np.uint8)
+    canvas = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    hue = (np.arange(found.count) * 67 % 180).astype(np.uint8)
+    colours = cv2.cvtColor(
+        np.stack([hue, np.full_like(hue, 255), np.full_like(hue, 255)], axis=1)[None], cv2.COLOR_HSV2BGR
+    )[0]
+    r = np.clip(np.rint(row), 0, canvas.shape[0] - 1).astype(np.int64)
+    c = np.clip(np.rint(col), 0, canvas.shape[1] - 1).astype(np.int64)
+    canvas[r, c] = colours[found.label]
+    return canvas
+
+
+def _configure_bench(parser: ArgumentParser) -> None:
+    parser.add_argument("--frames", type=int, default=3, help="frames per height (default 3)")
+    parser.add_argument("--seed", type=int, default=90_000, help="of the rendered frames")
+    parser.add_argument("--json", action="store_true", help="one JSON object instead of the tables")
+
+
+def _run_bench(arguments: Namespace) -> int:
+    from wearline_reconstruct.bench import run_bench
+
+    if not 1 <= arguments.frames <= 1000:
+        raise UsageError(f"{arguments.frames} frames cannot be", "--frames", "give 1 to 1000")
+    return run_bench(arguments.frames, arguments.seed, arguments.json)
+
+
+CALIBRATE = Command("calibrate", "calibrate a head from plates at known heights", _configure_calibrate, _run_calibrate)
+RECONSTRUCT = Command("reconstruct", "frames to heights on the laser lines", _configure_reconstruct, _run_reconstruct)
+BENCH = Command("bench", "speed and precision on simulated parts, beside the thesis' tables", _configure_bench, _run_bench)

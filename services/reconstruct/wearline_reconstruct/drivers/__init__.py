@@ -1,0 +1,1 @@
+"""What holds files: artifacts kept between starts, pictures from disk."""
