@@ -59,10 +59,23 @@ def fragments(peaks: Peaks, scale: Scale, average_px: int, settings: LineSetting
     sigma, length = position_noise(peaks, label, scale, average_px)
     broken, doubtful = _breaks(peaks, label, sigma, length, settings.break_sigma)
     label = label + np.cumsum(broken)
-    keep = ~doubtful
+    keep = ~doubtful & ~_smeared_ends(peaks, label, average_px // 2)
     peaks, label, sigma = peaks.take(keep), label[keep], sigma[keep]
     order, label = _longer(peaks, label, max(settings.shortest_px // 2, 6))
     return Fragments(peaks.take(order), label, sigma[order], length)
+
+
+def _smeared_ends(peaks: Peaks, label: I64, reach: int) -> Bool:
+    """Peaks beyond the true end of a line: averaging along it shows them there."""
+    first = np.ones(len(label), bool)
+    first[1:] = label[1:] != label[:-1]
+    number = np.cumsum(first) - 1
+    begin = peaks.along[first][number]
+    end = peaks.along[np.flatnonzero(first)[1:] - 1] if len(label) else begin
+    end = np.append(end, peaks.along[-1:])[number]
+    size = int(peaks.along.max(initial=0))
+    from_begin, to_end = peaks.along - begin, end - peaks.along
+    return ((from_begin < reach) & (begin > reach)) | ((to_end < reach) & (end < size - reach))
 
 
 def _tracks(peaks: Peaks, scale: Scale, settings: LineSettings) -> I64:
@@ -186,7 +199,6 @@ def position_noise(peaks: Peaks, label: I64, scale: Scale, average_px: int) -> t
 
 def _error_length(y: F64, label: I64, along: I32, average_px: int, lag: int) -> float:
     """Variance of sums of neighbouring errors over that of independent ones, from second differences."""
-    short = np.zeros(0)
     ratio = float(average_px)
     reach = 4 * lag
     if len(y) <= 4 * reach:
@@ -204,7 +216,6 @@ def _error_length(y: F64, label: I64, along: I32, average_px: int, lag: int) -> 
         third = (mean[3 * step :] - 3 * mean[2 * step : -step] + 3 * mean[step : -2 * step] - mean[: -3 * step])[same]
         return float(np.median(np.abs(third)) ** 2) if len(third) > 50 else float("nan")
 
-    del short
     block = 2 * lag
     point, blocked = spread(1, block + lag), spread(block, block + lag)
     if not np.isfinite(point) or not np.isfinite(blocked) or point <= 0.0:

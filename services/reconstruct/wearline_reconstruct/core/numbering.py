@@ -96,6 +96,8 @@ class _Pairs:
     second: I64
     cost: F64
     """[pair, label of first, label of second]"""
+    weight: F64
+    """Cross sections that show the pair."""
 
 
 def number_fragments(
@@ -134,11 +136,12 @@ def number_fragments(
     signal = found.peaks.signal_dn[use]
     usual = float(np.median(signal))
     strength = np.bincount(node, weights=signal, minlength=len(chosen)) / total / max(usual, 1e-6)
-    unary[:, -1] = 0.6 * total / _COLUMN_STEP * np.clip(strength, 0.15, 1.0) + 0.5
+    unary[:, -1] = 1.5 * total / _COLUMN_STEP * np.clip(strength, 0.1, 1.0) + 0.5
     _fix(unary, along, across, node, pitch_px, spots, constraints, calibration)
     pairs = _neighbours_across(node, along, across, z, step_mm, labels, len(chosen))
     follow = _neighbours_along(node, along, across, z, step_mm, pitch_px, labels, len(chosen))
     best, lead = _propagate(unary, [pairs, follow])
+    best, lead = _shifted_patches(best, lead, unary, pairs, follow)
     settled = (best < calibration.lines) & (lead >= settings.least_margin)
     settled &= unary[np.arange(len(chosen)), best] < _NEVER
     result = np.where(settled, best, NONE)
@@ -188,7 +191,7 @@ def _neighbours_across(
     column = along % _COLUMN_STEP == 0
     index = np.flatnonzero(column)
     index = index[np.lexsort((across[index], along[index]))]
-    firsts, seconds, costs = [], [], []
+    firsts, seconds, costs, weights = [], [], [], []
     order = np.arange(labels - 1)
     missing = order[None, :] - order[:, None] - 1
     gap_cost = np.where(missing < 0, _NEVER, np.where(missing == 0, 0.0, 0.6 + 0.25 * (missing - 1.0)))
@@ -212,7 +215,8 @@ def _neighbours_across(
         firsts.append(key // count)
         seconds.append(key % count)
         costs.append(cost)
-    return _joined(firsts, seconds, costs, labels)
+        weights.append(np.minimum(weight, 60).astype(np.float64))
+    return _joined(firsts, seconds, costs, weights, labels)
 
 
 def _mean_jump(z: F64, upper: I64, lower: I64, pair: I64, pairs: int) -> F64:
@@ -242,18 +246,21 @@ def _neighbours_along(
         for target in near:
             jump = np.abs(z[:, end][:, None] - z[:, first[target]][None, :]) / step_mm
             cost = np.zeros((labels, labels))
-            strength = 3.0 * (1.0 - gap[target] / reach)
+            # A line that goes on without a jump is the same one; after a jump this says little.
+            strength = (3.0 if drift[target] < 0.05 * pitch_px else 1.0) * (1.0 - gap[target] / reach)
             cost[:-1, :-1] = strength * np.minimum(np.nan_to_num(jump, nan=1.0), 1.0)
             firsts.append(source)
             seconds.append(int(target))
             costs.append(cost[None])
-    return _joined([np.array(firsts, np.int64)], [np.array(seconds, np.int64)], costs, labels)
+    return _joined(
+        [np.array(firsts, np.int64)], [np.array(seconds, np.int64)], costs, [np.ones(len(firsts))], labels
+    )
 
 
-def _joined(firsts: list[I64], seconds: list[I64], costs: list[F64], labels: int) -> _Pairs:
+def _joined(firsts: list[I64], seconds: list[I64], costs: list[F64], weights: list[F64], labels: int) -> _Pairs:
     if not costs:
-        return _Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, labels, labels)))
-    return _Pairs(np.concatenate(firsts), np.concatenate(seconds), np.concatenate(costs))
+        return _Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, labels, labels)), np.zeros(0))
+    return _Pairs(np.concatenate(firsts), np.concatenate(seconds), np.concatenate(costs), np.concatenate(weights))
 
 
 def _propagate(unary: F64, groups: list[_Pairs], turns: int = 60) -> tuple[I64, F64]:
@@ -288,6 +295,70 @@ def _propagate(unary: F64, groups: list[_Pairs], turns: int = 60) -> tuple[I64, 
             break
     ranked = np.sort(belief, axis=1)
     return np.argmin(belief, axis=1).astype(np.int64), (ranked[:, 1] - ranked[:, 0]).astype(np.float64)
+
+
+def _energy(label: I64, unary: F64, groups: tuple[_Pairs, ...]) -> float:
+    total = float(unary[np.arange(len(label)), label].sum())
+    for group in groups:
+        total += float(group.cost[np.arange(len(group.first)), label[group.first], label[group.second]].sum())
+    return total
+
+
+def _shifted_patches(
+    best: I64, lead: F64, unary: F64, pairs: _Pairs, follow: _Pairs
+) -> tuple[I64, F64]:
+    """Let whole patches change their numbers together, and bound the leads by what such a change costs.
+
+    Fragments beside each other hold each other's numbers firmly; whether all of them are one off is
+    a question that single fragments cannot answer, and belief propagation on loops answers too surely.
+    """
+    none = unary.shape[1] - 1
+    patch = _patches(best, pairs, len(unary), none)
+    groups = (pairs, follow)
+    best = best.copy()
+    energy = _energy(best, unary, groups)
+    gaps = np.full(len(unary), np.inf)
+    for _ in range(3):
+        moved = False
+        gaps[:] = np.inf
+        for number in np.unique(patch[best != none]):
+            members = (patch == number) & (best != none)
+            for shift in (-1, 1, -2, 2):
+                trial = best.copy()
+                wanted = best[members] + shift
+                wanted = np.where((wanted < 0) | (wanted >= none), none, wanted)
+                # What cannot bear its new number bears none.
+                wanted = np.where(unary[members, wanted] >= _NEVER, none, wanted)
+                trial[members] = wanted
+                if (wanted == none).all():
+                    continue
+                cost = _energy(trial, unary, groups)
+                if cost < energy - 1e-6:
+                    best, energy, moved = trial, cost, True
+                    break
+                gaps[members] = np.minimum(gaps[members], cost - energy)
+            if moved:
+                break
+        if not moved:
+            break
+    return best, np.minimum(lead, gaps)
+
+
+def _patches(best: I64, pairs: _Pairs, count: int, none: int) -> I64:
+    """Patch of each fragment: neighbours across the lines whose numbers follow each other at like heights."""
+    patch = np.arange(count)
+    a, b = best[pairs.first], best[pairs.second]
+    cost = pairs.cost[np.arange(len(a)), a, b]
+    usual = pairs.cost.min(axis=(1, 2))
+    follows = (a != none) & (b != none) & (b == a + 1)
+    # A rise of a quarter of a pitch height is within one surface; more may be a step.
+    weight = np.maximum(pairs.weight, 1.0)
+    joined = follows & (cost / weight < 0.25) & (usual < _NEVER)
+    for first, second in zip(pairs.first[joined], pairs.second[joined], strict=True):
+        old, new = patch[second], patch[first]
+        if old != new:
+            patch[patch == old] = new
+    return patch
 
 
 def _ordered(number: I64, lead: F64, node: I64, along: I64, across: F64) -> I64:

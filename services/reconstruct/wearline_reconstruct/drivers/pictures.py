@@ -17,7 +17,7 @@ _CURE = "take an 8- or 16-bit grey or colour picture"
 def read_picture(path: Path) -> NDArray[np.uint8] | NDArray[np.float32]:
     """An 8- or 16-bit grey or colour picture as [row, col]: uint8, or float32 in DN of 8 bits for 16-bit files.
 
-    Of a colour picture each pixel's strongest channel counts: a laser line is bright in one of them.
+    Of a colour picture the mean of the channels counts: a bright line fills all of them, its halo only one.
 
     Raises:
         FrameError: missing, truncated, or no picture (code 21).
@@ -43,7 +43,9 @@ def read_picture(path: Path) -> NDArray[np.uint8] | NDArray[np.float32]:
         raise FrameError("is no 8- or 16-bit picture, or is damaged", where, _CURE, code)
     if picture.ndim == 3:
         colours = picture[:, :, :3] if picture.shape[2] >= 3 else picture[:, :, :1]
-        picture = colours.max(axis=2)
+        full = np.float32(255.0 if picture.dtype == np.uint8 else 65535.0)
+        mean = np.rint(colours.astype(np.float32).mean(axis=2))
+        picture = np.minimum(mean, full).astype(picture.dtype)
     if picture.dtype == np.uint8:
         return np.ascontiguousarray(picture, np.uint8)
     # Cameras put 10 to 14 bits into 16 without scaling them.
