@@ -338,6 +338,9 @@ def _measured(found: Fragments, number: I64, spot_found: bool, prepared: Prepare
 def _one_each(number: I64, found: Fragments, keep: I64, along_size: int) -> I64:
     """Indices into ``keep``: where two peaks claim one place of a line, the stronger."""
     place = number * along_size + found.peaks.along[keep]
+    times = np.bincount(place)
+    if times.max(initial=0) <= 1:
+        return np.arange(len(keep))
     order = np.lexsort((-found.peaks.signal_dn[keep], place))
     ordered = place[order]
     first = np.ones(len(order), bool)

@@ -37,6 +37,8 @@ class NumberingSettings(Settings):
     """In inspection, a point within this share of the pitch from the template's line is that line."""
     least_margin: float = 2.0
     """Cost by which the best number must lead; 1 = a height difference of one pitch over four columns."""
+    least_patch_margin: float = 0.2
+    """And per cross section of its rim, a patch of lines against the same patch one number off."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,22 @@ class Numbers:
 
 
 @dataclass(frozen=True)
+class _Rules:
+    """What jumps and missing lines cost, per cross section."""
+
+    jump: float
+    """A height difference that moves a line by one pitch."""
+    missing: float
+    """The first line missing without a reason."""
+    further: float
+    """Each further one."""
+    wall: float
+    """+1: walls that rise with the line number face the laser and swallow lines; -1: those that fall."""
+    alive: Bool
+    """(line,): seen somewhere."""
+
+
+@dataclass(frozen=True)
 class _Pairs:
     first: I64
     second: I64
@@ -117,31 +135,45 @@ def number_fragments(
     chosen = np.sort(np.argsort(-size, kind="stable")[:_MOST_FRAGMENTS])
     index_of = np.full(count, -1)
     index_of[chosen] = np.arange(len(chosen))
-    node = index_of[found.label]
-    use = node >= 0
-    along = found.peaks.along[use].astype(np.int64)
-    across = found.peaks.across_px[use].astype(np.float64)
-    node = node[use]
+    # Every fourth column says all; the first and last peak of a fragment stay, for what follows along the line.
+    peaks, ends = found.peaks, found.first
+    sparse = peaks.along % _COLUMN_STEP == 0
+    sparse[ends[:-1]] = True
+    sparse[ends[1:] - 1] = True
+    use = np.flatnonzero(sparse & (index_of[found.label] >= 0))
+    node = index_of[found.label[use]]
+    along, across = peaks.along[use].astype(np.int64), peaks.across_px[use].astype(np.float64)
     d = across - calibration.across0_px[:, along]
     z = calibration.a_mm_per_px[:, along] * d / (1.0 + calibration.b_per_px * d)
-    step_mm = float(np.nanmedian(np.abs(calibration.a_mm_per_px))) * pitch_px
+    a_usual = float(np.nanmedian(calibration.a_mm_per_px[:, ::16]))
+    step_mm = abs(a_usual) * pitch_px
     low, high = calibration.z_range_mm
     with np.errstate(invalid="ignore"):
         fits = (z >= low) & (z <= high)
-    total = np.bincount(node, minlength=len(chosen))
-    share = np.stack([np.bincount(node, weights=f, minlength=len(chosen)) for f in fits], axis=1) / total[:, None]
+    # Points are ordered by fragment, so that sums over fragments are sums over slices.
+    starts = np.searchsorted(node, np.arange(len(chosen)))
+    total = np.diff(np.append(starts, len(node)))
+    share = np.add.reduceat(fits.astype(np.float64), starts, axis=1).T / total[:, None]
     labels = calibration.lines + 1
     unary = np.full((len(chosen), labels), _NEVER)
     unary[:, :-1] = np.where(share >= 0.7, 4.0 * (1.0 - share), _NEVER)
-    signal = found.peaks.signal_dn[use]
-    usual = float(np.median(signal))
-    strength = np.bincount(node, weights=signal, minlength=len(chosen)) / total / max(usual, 1e-6)
-    unary[:, -1] = 1.5 * total / _COLUMN_STEP * np.clip(strength, 0.1, 1.0) + 0.5
+    signal = peaks.signal_dn[use].astype(np.float64)
+    strength = np.add.reduceat(signal, starts) / total / max(float(np.median(signal)), 1e-6)
+    unary[:, -1] = 1.5 * total * np.clip(strength, 0.1, 1.0) + 0.5
     _fix(unary, along, across, node, pitch_px, spots, constraints, calibration)
-    pairs = _neighbours_across(node, along, across, z, step_mm, labels, len(chosen))
     follow = _neighbours_along(node, along, across, z, step_mm, pitch_px, labels, len(chosen))
+    wall = -float(np.sign(a_usual))
+    alive = np.isfinite(calibration.across0_px).any(axis=1)
+    pairs = _neighbours_across(node, along, across, z, step_mm, labels, len(chosen), _Rules(1.0, 0.6, 0.25, wall, alive))
     best, lead = _propagate(unary, [pairs, follow])
-    best, lead = _shifted_patches(best, lead, unary, pairs, follow)
+    if not _is_plain(best, pairs, unary):
+        # Lines that are somewhere in the picture do not vanish elsewhere without a reason; dead ones do.
+        alive = np.bincount(best, weights=total, minlength=labels)[:-1] > 0
+        pairs = _neighbours_across(
+            node, along, across, z, step_mm, labels, len(chosen), _Rules(0.6, 1.6, 0.5, wall, alive)
+        )
+        best, lead = _propagate(unary, [pairs, follow])
+        best, lead = _shifted_patches(best, lead, unary, pairs, follow, settings.least_patch_margin)
     settled = (best < calibration.lines) & (lead >= settings.least_margin)
     settled &= unary[np.arange(len(chosen)), best] < _NEVER
     result = np.where(settled, best, NONE)
@@ -185,16 +217,17 @@ def _nearest_node(along: I64, across: F64, node: I64, at: float, over: float, pi
 
 
 def _neighbours_across(
-    node: I64, along: I64, across: F64, z: F64, step_mm: float, labels: int, count: int
+    node: I64, along: I64, across: F64, z: F64, step_mm: float, labels: int, count: int, rules: _Rules
 ) -> _Pairs:
     """Fragments that are neighbours in a cross section: order, missing lines, like heights."""
-    column = along % _COLUMN_STEP == 0
-    index = np.flatnonzero(column)
+    index = np.flatnonzero(along % _COLUMN_STEP == 0)
     index = index[np.lexsort((across[index], along[index]))]
     firsts, seconds, costs, weights = [], [], [], []
     order = np.arange(labels - 1)
-    missing = order[None, :] - order[:, None] - 1
-    gap_cost = np.where(missing < 0, _NEVER, np.where(missing == 0, 0.0, 0.6 + 0.25 * (missing - 1.0)))
+    is_behind = order[None, :] <= order[:, None]
+    # Lines between two numbers, those alone that could be seen.
+    before = np.concatenate([[0], np.cumsum(rules.alive)])
+    between = np.where(is_behind, 0, before[order][None, :] - before[order + 1][:, None]).astype(np.float64)
     for reach in (1, 2):
         upper, lower = index[:-reach], index[reach:]
         same = (along[upper] == along[lower]) & (node[upper] != node[lower])
@@ -207,9 +240,11 @@ def _neighbours_across(
         cost = np.zeros((len(key), labels, labels))
         if reach == 1:
             jump = _mean_jump(z, upper, lower, inverse, len(key)) / step_mm
-            cost[:, :-1, :-1] = (jump + gap_cost) * np.minimum(weight, 60)[:, None, None]
-        else:
-            cost[:, :-1, :-1] = np.where(missing < 0, _NEVER, 0.0)
+            # Lines that a wall swallows are no surprise.
+            lost = np.maximum(between - np.maximum(rules.wall * jump, 0.0), 0.0)
+            gap = np.minimum(lost, 1.0) * rules.missing + np.maximum(lost - 1.0, 0.0) * rules.further
+            cost[:, :-1, :-1] = (rules.jump * np.abs(jump) + gap) * np.minimum(weight, 60)[:, None, None]
+        cost[:, :-1, :-1] = np.where(is_behind, _NEVER, cost[:, :-1, :-1])
         # One column may be a crossing of noise; it must not forbid anything for ever.
         cost = np.minimum(cost, np.where(weight >= 2, _NEVER, 4.0)[:, None, None])
         firsts.append(key // count)
@@ -220,12 +255,25 @@ def _neighbours_across(
 
 
 def _mean_jump(z: F64, upper: I64, lower: I64, pair: I64, pairs: int) -> F64:
-    """[pair, label above, label below]: mean size of the height difference, from means over both sides. [mm]"""
-    weight = np.bincount(pair, minlength=pairs)
-    above = np.stack([np.bincount(pair, weights=np.nan_to_num(row[upper], nan=1e3), minlength=pairs) for row in z], 1)
-    below = np.stack([np.bincount(pair, weights=np.nan_to_num(row[lower], nan=1e3), minlength=pairs) for row in z], 1)
-    above, below = above / weight[:, None], below / weight[:, None]
-    return np.abs(above[:, :, None] - below[:, None, :]).clip(0.0, 1e3)
+    """[pair, label above, label below]: rise from the one to the other, from means over their common columns. [mm]"""
+    order = np.argsort(pair, kind="stable")
+    starts = np.searchsorted(pair[order], np.arange(pairs))
+    weight = np.diff(np.append(starts, len(pair)))
+    above, below = (
+        np.add.reduceat(np.nan_to_num(z[:, side[order]], nan=1e3), starts, axis=1).T / weight[:, None]
+        for side in (upper, lower)
+    )
+    return np.asarray((below[:, None, :] - above[:, :, None]).clip(-1e3, 1e3))
+
+
+def _is_plain(best: I64, pairs: _Pairs, unary: F64) -> bool:
+    """All neighbours count up by one at like heights: nothing could be one off."""
+    none = unary.shape[1] - 1
+    if (best == none).any():
+        return False
+    a, b = best[pairs.first], best[pairs.second]
+    cost = pairs.cost[np.arange(len(a)), a, b] / pairs.weight
+    return bool((cost < 0.3).all()) and len(np.unique(best)) == none
 
 
 def _neighbours_along(
@@ -305,7 +353,7 @@ def _energy(label: I64, unary: F64, groups: tuple[_Pairs, ...]) -> float:
 
 
 def _shifted_patches(
-    best: I64, lead: F64, unary: F64, pairs: _Pairs, follow: _Pairs
+    best: I64, lead: F64, unary: F64, pairs: _Pairs, follow: _Pairs, least: float
 ) -> tuple[I64, F64]:
     """Let whole patches change their numbers together, and bound the leads by what such a change costs.
 
@@ -336,12 +384,17 @@ def _shifted_patches(
                 if cost < energy - 1e-6:
                     best, energy, moved = trial, cost, True
                     break
-                gaps[members] = np.minimum(gaps[members], cost - energy)
+                gaps[members] = np.minimum(gaps[members], cost - energy - least * _rim(members, pairs))
             if moved:
                 break
         if not moved:
             break
     return best, np.minimum(lead, gaps)
+
+
+def _rim(members: Bool, pairs: _Pairs) -> float:
+    """Cross sections in which a patch has a neighbour."""
+    return float(pairs.weight[members[pairs.first] != members[pairs.second]].sum())
 
 
 def _patches(best: I64, pairs: _Pairs, count: int, none: int) -> I64:

@@ -51,8 +51,9 @@ def find_spots(strip: Image, scale: Scale, search: Search | None = None, most: i
     opened = cv2.morphologyEx(light, cv2.MORPH_OPEN, np.ones((size, size), np.uint8), borderType=cv2.BORDER_REPLICATE)
     excess = light - cv2.blur(opened, (period, period))
     ambient = cv2.erode(small, np.ones((1, period | 1), np.uint8))
-    line_light = float(np.percentile(light - cv2.blur(ambient, (period, length)), 70))
-    noise = float(np.median(np.abs(excess - np.median(excess)))) / 0.6745
+    line_light = float(np.percentile((light - cv2.blur(ambient, (period, length)))[::3, ::4], 70))
+    sparse = excess[::3, ::3]
+    noise = float(np.median(np.abs(sparse - np.median(sparse)))) / 0.6745
     least = max(_LEAST_EXCESS * line_light, _LEAST_NOISE * noise, 0.1)
     allowed = np.zeros(excess.shape, np.uint8)
     if search is None:

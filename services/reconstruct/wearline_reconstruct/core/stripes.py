@@ -215,8 +215,8 @@ def stripe_peaks(
     inner = _odd(1.6 * scale.width_px)
     near = cv2.blur(strip, (inner, length), borderType=cv2.BORDER_REPLICATE)
     around = cv2.blur(near, (window, 1), borderType=cv2.BORDER_REFLECT_101)
-    sparse = near[::11].astype(np.float32)
-    noise = _background_noise(sparse - around[::11], sparse, scale.width_px)
+    sparse = near[::23].astype(np.float32)
+    noise = _background_noise(sparse - around[::23], sparse, scale.width_px)
     offset = max(settings.threshold_noise * noise, settings.threshold_dn)
     if strip.dtype == np.uint8:
         mask = cv2.compare(cv2.subtract(near, int(np.ceil(offset))), around, cv2.CMP_GT)
@@ -275,7 +275,7 @@ def _refined(
 ) -> Peaks:
     width = scale.width_px
     strength = summed[along, seed].astype(np.float32) * share
-    strength -= np.float32(np.percentile(summed[::16, ::4], 30)) * share
+    strength -= np.float32(np.percentile(summed[::32, ::5], 30)) * share
     ratio = noise_dn / max(float(np.median(strength)), 1.0) if len(seed) else 1.0
     # In the dark the tails carry the best part of what speckle leaves; in bright light, its texture.
     reach = float(np.interp(ratio, (0.01, 0.04), (3.1, 2.4)))
@@ -319,9 +319,11 @@ def _refine_chunk(
 ) -> None:
     """Shift from the seed, signal, width, background and top of each window [n, 2 half + 1] into ``out`` [5, n]."""
     half = core + flank
-    top = window[:, half - 1 : half + 2].max(axis=1)
-    left = window[:, :flank].mean(axis=1)
-    right = window[:, -flank:].mean(axis=1)
+    # Products with vectors: far quicker than sums over short rows.
+    top = np.maximum(np.maximum(window[:, half - 1], window[:, half]), window[:, half + 1])
+    even = np.full(flank, 1.0 / flank, np.float32)
+    left = window[:, :flank] @ even
+    right = window[:, -flank:] @ even
     # A neighbouring stripe in one flank must not pass for background.
     lower = np.minimum(left, right) + np.float32(8.0 * noise_dn)
     left, right = np.minimum(left, lower), np.minimum(right, lower)
@@ -336,6 +338,7 @@ def _refine_chunk(
     np.sqrt(root, out=root)
     edge = np.float32(core)
     ramp = np.float32(max(0.8 * width, 1.0))
+    ones = np.ones(len(xi), np.float32)
     shift = np.zeros(len(window), np.float32)
     for _ in range(3):
         # The taper moves with the centre, so that what noise leaves in the tails is symmetric about it.
@@ -346,7 +349,7 @@ def _refine_chunk(
         np.maximum(distance, 0.0, out=distance)
         np.minimum(distance, 1.0, out=distance)
         distance *= root
-        total = distance.sum(axis=1)
+        total = distance @ ones
         np.maximum(total, 1e-6, out=total)
         shift = (distance @ xi) / total
         np.clip(shift, 1 - core, core - 1, out=shift)
