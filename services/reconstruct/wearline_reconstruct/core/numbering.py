@@ -12,7 +12,7 @@ what is not clearly ahead stays without a number.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ NONE = -1
 _NEVER = 1e4
 _COLUMN_STEP = 4
 _MOST_FRAGMENTS = 400
+_MOST_PATCHES = 80
 
 
 class NumberingSettings(Settings):
@@ -116,6 +117,10 @@ class _Pairs:
     """[pair, label of first, label of second]"""
     weight: F64
     """Cross sections that show the pair."""
+    jump: F64
+    """[pair, label of first, label of second]: rise from the one to the other, in pitch heights."""
+    is_beside: Bool
+    """Nothing lies between the two."""
 
 
 def number_fragments(
@@ -222,7 +227,7 @@ def _neighbours_across(
     """Fragments that are neighbours in a cross section: order, missing lines, like heights."""
     index = np.flatnonzero(along % _COLUMN_STEP == 0)
     index = index[np.lexsort((across[index], along[index]))]
-    firsts, seconds, costs, weights = [], [], [], []
+    found = []
     order = np.arange(labels - 1)
     is_behind = order[None, :] <= order[:, None]
     # Lines between two numbers, those alone that could be seen.
@@ -238,6 +243,7 @@ def _neighbours_across(
             node[upper] * count + node[lower], return_inverse=True, return_counts=True
         )
         cost = np.zeros((len(key), labels, labels))
+        jump = np.zeros((len(key), labels - 1, labels - 1))
         if reach == 1:
             jump = _mean_jump(z, upper, lower, inverse, len(key)) / step_mm
             # Lines that a wall swallows are no surprise.
@@ -247,11 +253,9 @@ def _neighbours_across(
         cost[:, :-1, :-1] = np.where(is_behind, _NEVER, cost[:, :-1, :-1])
         # One column may be a crossing of noise; it must not forbid anything for ever.
         cost = np.minimum(cost, np.where(weight >= 2, _NEVER, 4.0)[:, None, None])
-        firsts.append(key // count)
-        seconds.append(key % count)
-        costs.append(cost)
-        weights.append(np.minimum(weight, 60).astype(np.float64))
-    return _joined(firsts, seconds, costs, weights, labels)
+        shown = np.minimum(weight, 60).astype(np.float64)
+        found.append(_Pairs(key // count, key % count, cost, shown, jump, np.full(len(key), reach == 1)))
+    return _joined(found, labels)
 
 
 def _mean_jump(z: F64, upper: I64, lower: I64, pair: I64, pairs: int) -> F64:
@@ -300,15 +304,22 @@ def _neighbours_along(
             firsts.append(source)
             seconds.append(int(target))
             costs.append(cost[None])
-    return _joined(
-        [np.array(firsts, np.int64)], [np.array(seconds, np.int64)], costs, [np.ones(len(firsts))], labels
-    )
-
-
-def _joined(firsts: list[I64], seconds: list[I64], costs: list[F64], weights: list[F64], labels: int) -> _Pairs:
     if not costs:
-        return _Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, labels, labels)), np.zeros(0))
-    return _Pairs(np.concatenate(firsts), np.concatenate(seconds), np.concatenate(costs), np.concatenate(weights))
+        return _joined([], labels)
+    n = len(costs)
+    return _Pairs(
+        np.array(firsts, np.int64), np.array(seconds, np.int64), np.concatenate(costs), np.ones(n),
+        np.zeros((n, labels - 1, labels - 1)), np.zeros(n, bool),
+    )  # fmt: skip
+
+
+def _joined(groups: list[_Pairs], labels: int) -> _Pairs:
+    none = np.zeros(0, np.int64)
+    empty = _Pairs(
+        none, none, np.zeros((0, labels, labels)), np.zeros(0), np.zeros((0, labels - 1, labels - 1)), np.zeros(0, bool)
+    )
+    groups = [empty, *groups]
+    return _Pairs(*(np.concatenate([getattr(g, entry.name) for g in groups]) for entry in fields(_Pairs)))
 
 
 def _propagate(unary: F64, groups: list[_Pairs], turns: int = 60) -> tuple[I64, F64]:
@@ -361,32 +372,28 @@ def _shifted_patches(
     a question that single fragments cannot answer, and belief propagation on loops answers too surely.
     """
     none = unary.shape[1] - 1
-    patch = _patches(best, pairs, len(unary), none)
     groups = (pairs, follow)
     best = best.copy()
     energy = _energy(best, unary, groups)
     gaps = np.full(len(unary), np.inf)
-    for _ in range(3):
-        moved = False
+    for _ in range(4):
         gaps[:] = np.inf
-        for number in np.unique(patch[best != none]):
-            members = (patch == number) & (best != none)
+        moved = False
+        for members in _patches(best, pairs, len(unary), none):
             for shift in (-1, 1, -2, 2):
                 trial = best.copy()
                 wanted = best[members] + shift
                 wanted = np.where((wanted < 0) | (wanted >= none), none, wanted)
                 # What cannot bear its new number bears none.
                 wanted = np.where(unary[members, wanted] >= _NEVER, none, wanted)
-                trial[members] = wanted
                 if (wanted == none).all():
                     continue
+                trial[members] = wanted
                 cost = _energy(trial, unary, groups)
                 if cost < energy - 1e-6:
                     best, energy, moved = trial, cost, True
-                    break
-                gaps[members] = np.minimum(gaps[members], cost - energy - least * _rim(members, pairs))
-            if moved:
-                break
+                else:
+                    gaps[members] = np.minimum(gaps[members], cost - energy - least * _rim(members, pairs))
         if not moved:
             break
     return best, np.minimum(lead, gaps)
@@ -397,21 +404,29 @@ def _rim(members: Bool, pairs: _Pairs) -> float:
     return float(pairs.weight[members[pairs.first] != members[pairs.second]].sum())
 
 
-def _patches(best: I64, pairs: _Pairs, count: int, none: int) -> I64:
-    """Patch of each fragment: neighbours across the lines whose numbers follow each other at like heights."""
-    patch = np.arange(count)
+def _patches(best: I64, pairs: _Pairs, count: int, none: int) -> list[Bool]:
+    """Sets of fragments that hang together: neighbours whose numbers follow each other at like heights.
+
+    What passes for like heights is tried at several levels, because a patch one number off may lie
+    nearly flush with what surrounds it.
+    """
     a, b = best[pairs.first], best[pairs.second]
-    cost = pairs.cost[np.arange(len(a)), a, b]
-    usual = pairs.cost.min(axis=(1, 2))
-    follows = (a != none) & (b != none) & (b == a + 1)
-    # A rise of a quarter of a pitch height is within one surface; more may be a step.
-    weight = np.maximum(pairs.weight, 1.0)
-    joined = follows & (cost / weight < 0.25) & (usual < _NEVER)
-    for first, second in zip(pairs.first[joined], pairs.second[joined], strict=True):
-        old, new = patch[second], patch[first]
-        if old != new:
-            patch[patch == old] = new
-    return patch
+    is_next = (a != none) & (b == a + 1) & pairs.is_beside
+    jump = np.where(is_next, pairs.jump[np.arange(len(a)), np.minimum(a, none - 1), np.minimum(b, none - 1)], np.inf)
+    found: dict[bytes, Bool] = {}
+    for level in (0.05, 0.12, 0.3):
+        patch = np.arange(count)
+        joined = np.abs(jump) < level
+        for first, second in zip(pairs.first[joined], pairs.second[joined], strict=True):
+            old, new = patch[second], patch[first]
+            if old != new:
+                patch[patch == old] = new
+        for number in np.unique(patch):
+            members = (patch == number) & (best != none)
+            if members.any():
+                found[members.tobytes()] = members
+    largest = sorted(found.values(), key=lambda members: -int(members.sum()))
+    return largest[:_MOST_PATCHES]
 
 
 def _ordered(number: I64, lead: F64, node: I64, along: I64, across: F64) -> I64:
