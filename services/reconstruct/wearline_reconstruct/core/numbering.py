@@ -26,6 +26,8 @@ from wearline_reconstruct.core.stripes import F32, F64, I64, Bool
 
 NONE = -1
 _NEVER = 1e4
+_BY_HAND = 1e3
+_BY_SPOT = 150.0
 _COLUMN_STEP = 4
 _MOST_FRAGMENTS = 400
 _MOST_PATCHES = 80
@@ -110,17 +112,35 @@ class _Rules:
 
 
 @dataclass(frozen=True)
+class _Candidates:
+    """The numbers that each fragment may bear; the last slot stands for none."""
+
+    label: I64
+    """[node, slot]: line number, `NONE` in unused slots and in the last one."""
+    slot: I64
+    """[node, line number]: its slot, -1 where the number is no candidate."""
+
+    @property
+    def slots(self) -> int:
+        return self.label.shape[1]
+
+
+@dataclass(frozen=True)
 class _Pairs:
     first: I64
     second: I64
     cost: F64
-    """[pair, label of first, label of second]"""
+    """[pair, slot of first, slot of second]"""
     weight: F64
     """Cross sections that show the pair."""
     jump: F64
-    """[pair, label of first, label of second]: rise from the one to the other, in pitch heights."""
+    """[pair, slot of first, slot of second]: rise from the one to the other, in pitch heights."""
     is_beside: Bool
     """Nothing lies between the two."""
+
+    def chosen(self, slot: I64) -> tuple[I64, I64, I64]:
+        """Index of each pair's entry for these slots of the nodes."""
+        return np.arange(len(self.first)), slot[self.first], slot[self.second]
 
 
 def number_fragments(
@@ -159,28 +179,29 @@ def number_fragments(
     starts = np.searchsorted(node, np.arange(len(chosen)))
     total = np.diff(np.append(starts, len(node)))
     share = np.add.reduceat(fits.astype(np.float64), starts, axis=1).T / total[:, None]
-    labels = calibration.lines + 1
-    unary = np.full((len(chosen), labels), _NEVER)
-    unary[:, :-1] = np.where(share >= 0.7, 4.0 * (1.0 - share), _NEVER)
+    base = np.where(share >= 0.7, 4.0 * (1.0 - share), _NEVER)
+    _fix_by_hand(base, along, across, node, pitch_px, constraints, calibration)
+    candidates, unary = _candidates(base)
     signal = peaks.signal_dn[use].astype(np.float64)
     strength = np.add.reduceat(signal, starts) / total / max(float(np.median(signal)), 1e-6)
     unary[:, -1] = 1.5 * total * np.clip(strength, 0.1, 1.0) + 0.5
-    _fix(unary, along, across, node, pitch_px, spots, constraints, calibration)
-    follow = _neighbours_along(node, along, across, z, step_mm, pitch_px, labels, len(chosen))
+    _fix_by_spot(unary, candidates, along, across, node, pitch_px, spots, calibration.lines // 2)
+    height = _Heights(z, candidates.label, step_mm)
+    follow = _neighbours_along(node, along, across, height, pitch_px, len(chosen))
+    beside = _cross_sections(node, along, across, len(chosen))
     wall = -float(np.sign(a_usual))
     alive = np.isfinite(calibration.across0_px).any(axis=1)
-    pairs = _neighbours_across(node, along, across, z, step_mm, labels, len(chosen), _Rules(1.0, 0.6, 0.25, wall, alive))
-    best, lead = _propagate(unary, [pairs, follow])
-    if not _is_plain(best, pairs, unary):
+    pairs = _neighbours_across(beside, height, _Rules(1.0, 0.6, 0.25, wall, alive))
+    best, lead = _propagate(unary, (pairs, follow))
+    if not _is_plain(best, pairs, candidates, calibration.lines):
         # Lines that are somewhere in the picture do not vanish elsewhere without a reason; dead ones do.
-        alive = np.bincount(best, weights=total, minlength=labels)[:-1] > 0
-        pairs = _neighbours_across(
-            node, along, across, z, step_mm, labels, len(chosen), _Rules(0.6, 1.6, 0.5, wall, alive)
-        )
-        best, lead = _propagate(unary, [pairs, follow])
-        best, lead = _shifted_patches(best, lead, unary, pairs, follow, settings.least_patch_margin)
-    settled = (best < calibration.lines) & (lead >= settings.least_margin)
-    settled &= unary[np.arange(len(chosen)), best] < _NEVER
+        named = candidates.label[np.arange(len(chosen)), best]
+        alive = np.bincount(named[named != NONE], minlength=calibration.lines) > 0
+        pairs = _neighbours_across(beside, height, _Rules(0.6, 1.6, 0.5, wall, alive))
+        best, lead = _propagate(unary, (pairs, follow))
+        best, lead = _shifted_patches(best, lead, unary, candidates, pairs, follow, settings.least_patch_margin)
+    settled = (lead >= settings.least_margin) & (unary[np.arange(len(chosen)), best] < _NEVER)
+    best = candidates.label[np.arange(len(chosen)), best]
     result = np.where(settled, best, NONE)
     result = _ordered(result, lead, node, along, across)
     number[chosen] = result
@@ -188,19 +209,45 @@ def number_fragments(
     return Numbers(number, margin)
 
 
-def _fix(
-    unary: F64, along: I64, across: F64, node: I64, pitch_px: float, spots: list[Spot],
-    constraints: tuple[LineConstraint, ...], calibration: Calibration,
+def _candidates(base: F64) -> tuple[_Candidates, F64]:
+    """From costs [node, line number] to slots: only what is possible, and the none at the end."""
+    possible = base < _NEVER
+    slots = int(possible.sum(axis=1).max(initial=0)) + 1
+    order = np.argsort(~possible, axis=1, kind="stable")[:, : slots - 1]
+    cost = np.take_along_axis(base, order, axis=1)
+    is_used = cost < _NEVER
+    label = np.concatenate([np.where(is_used, order, NONE), np.full((len(base), 1), NONE)], axis=1)
+    slot = np.full(base.shape, -1)
+    node, place = np.nonzero(is_used)
+    slot[node, order[node, place]] = place
+    unary = np.concatenate([np.where(is_used, cost, _NEVER), np.zeros((len(base), 1))], axis=1)
+    return _Candidates(label, slot), unary
+
+
+@dataclass(frozen=True)
+class _Heights:
+    """Heights of points under the candidate numbers of their fragments."""
+
+    z_mm: F64
+    """[line number, point]. [mm]"""
+    label: I64
+    """[node, slot]"""
+    step_mm: float
+    """Height that moves a line by one pitch. [mm]"""
+
+    def mean(self, owner: I64, point: I64, starts: I64) -> F64:
+        """[group, slot]: means over runs of points that begin at ``starts``, of fragment ``owner`` each."""
+        weight = np.diff(np.append(starts, len(point)))
+        summed = np.add.reduceat(np.nan_to_num(self.z_mm[:, point], nan=1e3), starts, axis=1) / weight
+        label = np.maximum(self.label[owner], 0)
+        return np.asarray(summed[label, np.arange(len(owner))[:, None]])
+
+
+def _fix_by_hand(
+    base: F64, along: I64, across: F64, node: I64, pitch_px: float, constraints: tuple[LineConstraint, ...],
+    calibration: Calibration,
 ) -> None:  # fmt: skip
-    """Enter the spot and the corrections by hand."""
-    middle = calibration.lines // 2
-    for spot in spots[:1]:
-        nearest = _nearest_node(along, across, node, spot.along_px, spot.across_px, pitch_px)
-        if nearest is not None and unary[nearest, middle] < _NEVER:
-            keep = unary[nearest, middle]
-            # Strong, not absolute: a reflection that passes for the spot must not outweigh the whole comb.
-            unary[nearest] += 150.0
-            unary[nearest, middle] = keep
+    """Corrections by hand leave a fragment no choice."""
     for constraint in constraints:
         if constraint.line >= calibration.lines:
             continue
@@ -208,8 +255,24 @@ def _fix(
         at, over = place if calibration.is_vertical else place[::-1]
         nearest = _nearest_node(along, across, node, at, over, pitch_px)
         if nearest is not None:
-            unary[nearest] = _NEVER
-            unary[nearest, constraint.line] = 0.0
+            base[nearest] = _NEVER
+            base[nearest, constraint.line] = -_BY_HAND
+
+
+def _fix_by_spot(
+    unary: F64, candidates: _Candidates, along: I64, across: F64, node: I64, pitch_px: float, spots: list[Spot],
+    middle: int,
+) -> None:  # fmt: skip
+    """The line with the spot is the middle one."""
+    for spot in spots[:1]:
+        nearest = _nearest_node(along, across, node, spot.along_px, spot.across_px, pitch_px)
+        if nearest is None or candidates.slot[nearest, middle] < 0:
+            continue
+        slot = int(candidates.slot[nearest, middle])
+        keep = unary[nearest, slot]
+        # Strong, not absolute: a reflection that passes for the spot must not outweigh the whole comb.
+        unary[nearest] += _BY_SPOT
+        unary[nearest, slot] = keep
 
 
 def _nearest_node(along: I64, across: F64, node: I64, at: float, over: float, pitch_px: float) -> int | None:
@@ -221,115 +284,125 @@ def _nearest_node(along: I64, across: F64, node: I64, at: float, over: float, pi
     return int(node[near[best]]) if distance[best] < 0.4 * pitch_px else None
 
 
-def _neighbours_across(
-    node: I64, along: I64, across: F64, z: F64, step_mm: float, labels: int, count: int, rules: _Rules
-) -> _Pairs:
-    """Fragments that are neighbours in a cross section: order, missing lines, like heights."""
+@dataclass(frozen=True)
+class _Beside:
+    """Pairs of fragments that are neighbours in cross sections, and the points that show it."""
+
+    first: I64
+    second: I64
+    weight: I64
+    upper: I64
+    """Points of the first fragments, grouped by pair."""
+    lower: I64
+    starts: I64
+    reach: int
+    """1: nothing between them, 2: one fragment between them."""
+
+
+def _cross_sections(node: I64, along: I64, across: F64, count: int) -> list[_Beside]:
     index = np.flatnonzero(along % _COLUMN_STEP == 0)
     index = index[np.lexsort((across[index], along[index]))]
     found = []
-    order = np.arange(labels - 1)
-    is_behind = order[None, :] <= order[:, None]
-    # Lines between two numbers, those alone that could be seen.
-    before = np.concatenate([[0], np.cumsum(rules.alive)])
-    between = np.where(is_behind, 0, before[order][None, :] - before[order + 1][:, None]).astype(np.float64)
     for reach in (1, 2):
         upper, lower = index[:-reach], index[reach:]
         same = (along[upper] == along[lower]) & (node[upper] != node[lower])
         upper, lower = upper[same], lower[same]
         if not len(upper):
             continue
-        key, inverse, weight = np.unique(
-            node[upper] * count + node[lower], return_inverse=True, return_counts=True
-        )
-        cost = np.zeros((len(key), labels, labels))
-        jump = np.zeros((len(key), labels - 1, labels - 1))
-        if reach == 1:
-            jump = _mean_jump(z, upper, lower, inverse, len(key)) / step_mm
+        key = node[upper] * count + node[lower]
+        order = np.argsort(key, kind="stable")
+        ordered = key[order]
+        starts = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+        weight = np.diff(np.append(starts, len(key)))
+        name = ordered[starts]
+        found.append(_Beside(name // count, name % count, weight, upper[order], lower[order], starts, reach))
+    return found
+
+
+def _neighbours_across(beside: list[_Beside], height: _Heights, rules: _Rules) -> _Pairs:
+    """Costs of neighbours in a cross section: order, missing lines, like heights."""
+    slots = height.label.shape[1]
+    # Lines between two numbers, those alone that could be seen.
+    before = np.concatenate([[0], np.cumsum(rules.alive)])
+    groups = []
+    for pair in beside:
+        above, below = height.label[pair.first][:, :, None], height.label[pair.second][:, None, :]
+        is_named = (above != NONE) & (below != NONE)
+        is_behind = is_named & (below <= above)
+        jump = np.zeros((len(pair.first), slots, slots))
+        cost = np.zeros_like(jump)
+        if pair.reach == 1:
+            z_above = height.mean(pair.first, pair.upper, pair.starts)
+            z_below = height.mean(pair.second, pair.lower, pair.starts)
+            jump = ((z_below[:, None, :] - z_above[:, :, None]) / height.step_mm).clip(-100.0, 100.0)
+            between = (before[np.maximum(below, 0)] - before[np.maximum(above, 0) + 1]).astype(np.float64)
             # Lines that a wall swallows are no surprise.
             lost = np.maximum(between - np.maximum(rules.wall * jump, 0.0), 0.0)
             gap = np.minimum(lost, 1.0) * rules.missing + np.maximum(lost - 1.0, 0.0) * rules.further
-            cost[:, :-1, :-1] = (rules.jump * np.abs(jump) + gap) * np.minimum(weight, 60)[:, None, None]
-        cost[:, :-1, :-1] = np.where(is_behind, _NEVER, cost[:, :-1, :-1])
+            shown = np.minimum(pair.weight, 60)[:, None, None]
+            cost = np.where(is_named, (rules.jump * np.abs(jump) + gap) * shown, 0.0)
+        cost = np.where(is_behind, _NEVER, cost)
         # One column may be a crossing of noise; it must not forbid anything for ever.
-        cost = np.minimum(cost, np.where(weight >= 2, _NEVER, 4.0)[:, None, None])
-        shown = np.minimum(weight, 60).astype(np.float64)
-        found.append(_Pairs(key // count, key % count, cost, shown, jump, np.full(len(key), reach == 1)))
-    return _joined(found, labels)
+        cost = np.minimum(cost, np.where(pair.weight >= 2, _NEVER, 4.0)[:, None, None])
+        weight = np.minimum(pair.weight, 60).astype(np.float64)
+        groups.append(_Pairs(pair.first, pair.second, cost, weight, jump, np.full(len(weight), pair.reach == 1)))
+    return _joined(groups, slots)
 
 
-def _mean_jump(z: F64, upper: I64, lower: I64, pair: I64, pairs: int) -> F64:
-    """[pair, label above, label below]: rise from the one to the other, from means over their common columns. [mm]"""
-    order = np.argsort(pair, kind="stable")
-    starts = np.searchsorted(pair[order], np.arange(pairs))
-    weight = np.diff(np.append(starts, len(pair)))
-    above, below = (
-        np.add.reduceat(np.nan_to_num(z[:, side[order]], nan=1e3), starts, axis=1).T / weight[:, None]
-        for side in (upper, lower)
-    )
-    return np.asarray((below[:, None, :] - above[:, :, None]).clip(-1e3, 1e3))
-
-
-def _is_plain(best: I64, pairs: _Pairs, unary: F64) -> bool:
+def _is_plain(best: I64, pairs: _Pairs, candidates: _Candidates, lines: int) -> bool:
     """All neighbours count up by one at like heights: nothing could be one off."""
-    none = unary.shape[1] - 1
-    if (best == none).any():
+    number = candidates.label[np.arange(len(best)), best]
+    if (number == NONE).any() or len(np.unique(number)) != lines:
         return False
-    a, b = best[pairs.first], best[pairs.second]
-    cost = pairs.cost[np.arange(len(a)), a, b] / pairs.weight
-    return bool((cost < 0.3).all()) and len(np.unique(best)) == none
+    return bool((pairs.cost[pairs.chosen(best)] < 0.3 * pairs.weight).all())
 
 
 def _neighbours_along(
-    node: I64, along: I64, across: F64, z: F64, step_mm: float, pitch_px: float, labels: int, count: int
+    node: I64, along: I64, across: F64, height: _Heights, pitch_px: float, count: int
 ) -> _Pairs:
     """Fragments that follow each other along the lines: the surface rather goes on at its height."""
-    order = np.lexsort((along, node))
-    first = order[np.searchsorted(node[order], np.arange(count))]
-    last = order[np.searchsorted(node[order], np.arange(count), side="right") - 1]
-    firsts, seconds, costs = [], [], []
+    first = np.searchsorted(node, np.arange(count))
+    last = np.append(first[1:], len(node)) - 1
+    slots = height.label.shape[1]
     reach = 4.0 * pitch_px
-    for source in range(count):
-        end = last[source]
-        gap = along[first] - along[end]
-        drift = np.abs(across[first] - across[end])
-        near = np.flatnonzero((gap > 0) & (gap < reach) & (drift < 1.3 * pitch_px))
-        near = near[np.argsort(gap[near] + drift[near])[:3]]
-        for target in near:
-            jump = np.abs(z[:, end][:, None] - z[:, first[target]][None, :]) / step_mm
-            cost = np.zeros((labels, labels))
-            # A line that goes on without a jump is the same one; after a jump this says little.
-            strength = (3.0 if drift[target] < 0.05 * pitch_px else 1.0) * (1.0 - gap[target] / reach)
-            cost[:-1, :-1] = strength * np.minimum(np.nan_to_num(jump, nan=1.0), 1.0)
-            firsts.append(source)
-            seconds.append(int(target))
-            costs.append(cost[None])
-    if not costs:
-        return _joined([], labels)
-    n = len(costs)
-    return _Pairs(
-        np.array(firsts, np.int64), np.array(seconds, np.int64), np.concatenate(costs), np.ones(n),
-        np.zeros((n, labels - 1, labels - 1)), np.zeros(n, bool),
-    )  # fmt: skip
+    gap = along[first][None, :] - along[last][:, None]
+    drift = np.abs(across[first][None, :] - across[last][:, None])
+    is_near = (gap > 0) & (gap < reach) & (drift < 1.3 * pitch_px)
+    if not is_near.any():
+        return _joined([], slots)
+    rank = np.where(is_near, gap + drift, np.inf)
+    # The three nearest that may follow.
+    nearest = np.argsort(rank, axis=1, kind="stable")[:, :3]
+    source = np.repeat(np.arange(count), nearest.shape[1])
+    target = nearest.reshape(-1)
+    keep = is_near[source, target]
+    source, target = source[keep], target[keep]
+    label_a, label_b = height.label[source], height.label[target]
+    z_a = height.z_mm[np.maximum(label_a, 0), last[source][:, None]]
+    z_b = height.z_mm[np.maximum(label_b, 0), first[target][:, None]]
+    jump = np.abs(z_a[:, :, None] - z_b[:, None, :]) / height.step_mm
+    # A line that goes on without a jump is the same one; after a jump this says little.
+    strength = np.where(drift[source, target] < 0.05 * pitch_px, 3.0, 1.0) * (1.0 - gap[source, target] / reach)
+    is_named = (label_a != NONE)[:, :, None] & (label_b != NONE)[:, None, :]
+    cost = np.where(is_named, strength[:, None, None] * np.minimum(np.nan_to_num(jump, nan=1.0), 1.0), 0.0)
+    n = len(source)
+    return _Pairs(source, target, cost, np.ones(n), np.zeros_like(cost), np.zeros(n, bool))
 
 
-def _joined(groups: list[_Pairs], labels: int) -> _Pairs:
-    none = np.zeros(0, np.int64)
-    empty = _Pairs(
-        none, none, np.zeros((0, labels, labels)), np.zeros(0), np.zeros((0, labels - 1, labels - 1)), np.zeros(0, bool)
-    )
-    groups = [empty, *groups]
+def _joined(groups: list[_Pairs], slots: int) -> _Pairs:
+    none, table = np.zeros(0, np.int64), np.zeros((0, slots, slots))
+    groups = [_Pairs(none, none, table, np.zeros(0), table, np.zeros(0, bool)), *groups]
     return _Pairs(*(np.concatenate([getattr(g, entry.name) for g in groups]) for entry in fields(_Pairs)))
 
 
-def _propagate(unary: F64, groups: list[_Pairs], turns: int = 60) -> tuple[I64, F64]:
-    """Minimum-sum belief propagation: best label per node and its lead over the second best."""
+def _propagate(unary: F64, groups: tuple[_Pairs, ...], turns: int = 60) -> tuple[I64, F64]:
+    """Minimum-sum belief propagation: best slot per node and its lead over the second best."""
     first = np.concatenate([g.first for g in groups])
     second = np.concatenate([g.second for g in groups])
     cost = np.minimum(np.concatenate([g.cost for g in groups]), _NEVER).astype(np.float32)
     source = np.concatenate([first, second])
     target = np.concatenate([second, first])
-    # Cost as seen by each directed message: [message, label of source, label of target].
+    # Cost as seen by each directed message: [message, slot of source, slot of target].
     towards = np.concatenate([cost, cost.transpose(0, 2, 1)])
     count, labels = unary.shape
     edges = len(first)
@@ -356,38 +429,41 @@ def _propagate(unary: F64, groups: list[_Pairs], turns: int = 60) -> tuple[I64, 
     return np.argmin(belief, axis=1).astype(np.int64), (ranked[:, 1] - ranked[:, 0]).astype(np.float64)
 
 
-def _energy(label: I64, unary: F64, groups: tuple[_Pairs, ...]) -> float:
-    total = float(unary[np.arange(len(label)), label].sum())
+def _energy(slot: I64, unary: F64, groups: tuple[_Pairs, ...]) -> float:
+    total = float(unary[np.arange(len(slot)), slot].sum())
     for group in groups:
-        total += float(group.cost[np.arange(len(group.first)), label[group.first], label[group.second]].sum())
+        total += float(group.cost[group.chosen(slot)].sum())
     return total
 
 
 def _shifted_patches(
-    best: I64, lead: F64, unary: F64, pairs: _Pairs, follow: _Pairs, least: float
+    best: I64, lead: F64, unary: F64, candidates: _Candidates, pairs: _Pairs, follow: _Pairs, least: float
 ) -> tuple[I64, F64]:
     """Let whole patches change their numbers together, and bound the leads by what such a change costs.
 
     Fragments beside each other hold each other's numbers firmly; whether all of them are one off is
     a question that single fragments cannot answer, and belief propagation on loops answers too surely.
     """
-    none = unary.shape[1] - 1
+    none = candidates.slots - 1
     groups = (pairs, follow)
     best = best.copy()
     energy = _energy(best, unary, groups)
     gaps = np.full(len(unary), np.inf)
+    nodes = np.arange(len(unary))
+    lines = candidates.slot.shape[1]
     for _ in range(4):
         gaps[:] = np.inf
         moved = False
-        for members in _patches(best, pairs, len(unary), none):
+        for members in _patches(best, pairs, candidates):
             for shift in (-1, 1, -2, 2):
-                trial = best.copy()
-                wanted = best[members] + shift
-                wanted = np.where((wanted < 0) | (wanted >= none), none, wanted)
+                number = candidates.label[nodes[members], best[members]] + shift
+                inside = (number >= 0) & (number < lines)
+                wanted = candidates.slot[nodes[members], np.clip(number, 0, lines - 1)]
                 # What cannot bear its new number bears none.
-                wanted = np.where(unary[members, wanted] >= _NEVER, none, wanted)
+                wanted = np.where(inside & (wanted >= 0), wanted, none)
                 if (wanted == none).all():
                     continue
+                trial = best.copy()
                 trial[members] = wanted
                 cost = _energy(trial, unary, groups)
                 if cost < energy - 1e-6:
@@ -404,15 +480,17 @@ def _rim(members: Bool, pairs: _Pairs) -> float:
     return float(pairs.weight[members[pairs.first] != members[pairs.second]].sum())
 
 
-def _patches(best: I64, pairs: _Pairs, count: int, none: int) -> list[Bool]:
+def _patches(best: I64, pairs: _Pairs, candidates: _Candidates) -> list[Bool]:
     """Sets of fragments that hang together: neighbours whose numbers follow each other at like heights.
 
     What passes for like heights is tried at several levels, because a patch one number off may lie
     nearly flush with what surrounds it.
     """
-    a, b = best[pairs.first], best[pairs.second]
-    is_next = (a != none) & (b == a + 1) & pairs.is_beside
-    jump = np.where(is_next, pairs.jump[np.arange(len(a)), np.minimum(a, none - 1), np.minimum(b, none - 1)], np.inf)
+    count = len(best)
+    number = candidates.label[np.arange(count), best]
+    a, b = number[pairs.first], number[pairs.second]
+    is_next = (a != NONE) & (b == a + 1) & pairs.is_beside
+    jump = np.where(is_next, pairs.jump[pairs.chosen(best)], np.inf)
     found: dict[bytes, Bool] = {}
     for level in (0.05, 0.12, 0.3):
         patch = np.arange(count)
@@ -421,8 +499,8 @@ def _patches(best: I64, pairs: _Pairs, count: int, none: int) -> list[Bool]:
             old, new = patch[second], patch[first]
             if old != new:
                 patch[patch == old] = new
-        for number in np.unique(patch):
-            members = (patch == number) & (best != none)
+        for name in np.unique(patch):
+            members = (patch == name) & (number != NONE)
             if members.any():
                 found[members.tobytes()] = members
     largest = sorted(found.values(), key=lambda members: -int(members.sum()))
