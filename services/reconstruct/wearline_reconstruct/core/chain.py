@@ -304,14 +304,17 @@ def _measured(found: Fragments, number: I64, spot_found: bool, prepared: Prepare
     grid_sigma[line, along] = slope * long_run
     label[line, along] = found.label[keep]
     starts = _piece_starts(label, grid_z)
-    process = _process_noise(grid_z, slope, fast, length, grid_sigma)
+    point = slope * np.sqrt(fast**2 + texture**2)
+    process = _process_noise(grid_z, float(np.median(point)), grid_sigma)
     smoothed = smooth(grid_z, grid_sigma, starts, 1.0, process, prepared.settings.smoothing)
-    z = smoothed.z_mm[line, along]
-    posterior = np.minimum(smoothed.sigma_mm[line, along], slope * np.sqrt(fast**2 + texture**2))
+    z_raw, z = z, smoothed.z_mm[line, along]
+    missed = _misfit(grid_z - smoothed.z_mm, float(np.median(slope * fast)), length)[line, along]
+    posterior = np.hypot(np.minimum(smoothed.sigma_mm[line, along], point), missed)
+    is_rejected = np.abs(z_raw - z) > 6.0 * np.hypot(point, missed)
     vibration = float(calibration.meta.get("vibration_px", 0.05)) * float(np.median(slope)) if len(slope) else 0.0
     common = float(np.hypot(vibration, float(calibration.meta.get("z_sigma_common_mm", 0.0))))
     sigma = np.sqrt(posterior**2 + calibration.z_sigma_mm[line, along] ** 2 + vibration**2)
-    good = np.isfinite(z) & np.isfinite(sigma) & ~smoothed.is_rejected[line, along]
+    good = np.isfinite(z) & np.isfinite(sigma) & ~is_rejected
     if recipe.roi is not None:
         x, y, width, height = recipe.roi
         row, col = (along, across) if calibration.is_vertical else (across, along)
@@ -372,26 +375,38 @@ def _piece_starts(label: I64, z: F64) -> Bool:
     return starts
 
 
-_LAG = 16
+_LAGS = (16, 32)
 _LONGEST_PX = 40.0
 
 
-def _process_noise(z: F64, slope: F64, fast: F64, length: float, sigma: F64) -> F64:
-    """Variance that the slope gains per pixel, (line, along), from the surface's own third differences. [mm^2/px^3]"""
+def _process_noise(z: F64, point_mm: float, sigma: F64) -> F64:
+    """Variance that the slope gains per pixel, (line, along), from the surface's own third differences. [mm^2/px^3]
+
+    Third differences of a surface whose slope is a random walk have the variance q lag^3.
+    """
     usual = float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else 0.0
-    least = usual**2 / _LONGEST_PX**4
-    process = np.full(z.shape, least)
-    if z.shape[1] <= 4 * _LAG:
-        return process
-    third = z[:, 3 * _LAG :] - 3.0 * z[:, 2 * _LAG : -_LAG] + 3.0 * z[:, _LAG : -2 * _LAG] - z[:, : -3 * _LAG]
-    noise = 20.0 * float(np.median((slope * fast) ** 2))
-    squared = np.where(np.isfinite(third), third * third, 0.0).astype(np.float32)
-    have = np.isfinite(third).astype(np.float32)
-    window = (3 * _LAG + 1, 1)
-    mean = cv2.blur(squared, window) / np.maximum(cv2.blur(have, window), 1e-3)
-    excess = np.maximum(mean - 1.5 * noise, 0.0) / _LAG**3
-    start = 3 * _LAG // 2
-    process[:, start : start + excess.shape[1]] += excess
-    process[:, :start] += excess[:, :1]
-    process[:, start + excess.shape[1] :] += excess[:, -1:]
+    process = np.full(z.shape, usual**2 / _LONGEST_PX**4)
+    for lag in _LAGS:
+        if z.shape[1] <= 4 * lag:
+            continue
+        third = z[:, 3 * lag :] - 3.0 * z[:, 2 * lag : -lag] + 3.0 * z[:, lag : -2 * lag] - z[:, : -3 * lag]
+        have = np.isfinite(third)
+        squared = np.where(have, third * third, 0.0).astype(np.float32)
+        mean = cv2.blur(squared, (17, 1)) / np.maximum(cv2.blur(have.astype(np.float32), (17, 1)), 0.05)
+        excess = np.maximum(mean - np.float32(2.5 * 20.0 * point_mm**2), 0.0) / lag**3
+        # A bend lies anywhere within the reach of the difference that shows it.
+        excess = cv2.dilate(excess, np.ones((1, 2 * lag + 1), np.uint8))
+        start = 3 * lag // 2
+        padded = np.pad(excess, ((0, 0), (start, z.shape[1] - excess.shape[1] - start)), mode="edge")
+        np.maximum(process, padded, out=process)
     return process
+
+
+def _misfit(residual: F64, fast_mm: float, length: float) -> F64:
+    """What the smoother leaves of the surface's shape: residuals that are alike over more than noise is. [mm]"""
+    have = np.isfinite(residual)
+    window = (25, 1)
+    count = cv2.blur(have.astype(np.float32), window)
+    mean = cv2.blur(np.where(have, residual, 0.0).astype(np.float32), window) / np.maximum(count, 0.05)
+    expected = fast_mm**2 * min(length / 25.0, 1.0)
+    return np.sqrt(np.maximum(mean.astype(np.float64) ** 2 - 4.0 * expected, 0.0))

@@ -40,7 +40,7 @@ class NumberingSettings(Settings):
     """In inspection, a point within this share of the pitch from the template's line is that line."""
     least_margin: float = 2.0
     """Cost by which the best number must lead; 1 = a height difference of one pitch over four columns."""
-    least_patch_margin: float = 0.2
+    least_patch_margin: float = 0.45
     """And per cross section of its rim, a patch of lines against the same patch one number off."""
 
 
@@ -477,7 +477,7 @@ def _shifted_patches(
 
 def _rim(members: Bool, pairs: _Pairs) -> float:
     """Cross sections in which a patch has a neighbour."""
-    return float(pairs.weight[members[pairs.first] != members[pairs.second]].sum())
+    return float(pairs.weight[(members[pairs.first] != members[pairs.second]) & pairs.is_beside].sum())
 
 
 def _patches(best: I64, pairs: _Pairs, candidates: _Candidates) -> list[Bool]:

@@ -27,7 +27,7 @@ _WIDE = 1e6
 class SmoothingSettings(Settings):
     """How strongly heights are smoothed along a line."""
 
-    gate_sigma: float = 4.5
+    gate_sigma: float = 6.0
     """A point further off the prediction than this many standard deviations does not enter."""
     overlap_px: int = 64
     """Run-in of each piece; longer than the memory of the filter. [px]"""
@@ -40,8 +40,6 @@ class Smoothed:
     z_mm: F64
     sigma_mm: F64
     """Posterior standard deviation. [mm]"""
-    is_rejected: Bool
-    """The point contradicts its neighbours."""
 
 
 def smooth(
@@ -58,7 +56,7 @@ def smooth(
     """
     lines, size = z_mm.shape
     if not np.isfinite(z_mm).any():
-        return Smoothed(z_mm.copy(), sigma_mm.copy(), np.zeros(z_mm.shape, bool))
+        return Smoothed(z_mm.copy(), sigma_mm.copy())
     # Neighbouring points share their error, so that each brings only its share of news.
     variance = np.where(np.isfinite(z_mm), sigma_mm**2 * max(correlation_px, 1.0), np.inf)
     ends = np.zeros_like(starts)
@@ -133,7 +131,7 @@ def _filter(z: F64, variance: F64, process: F64, starts: Bool, *, gate: float, r
         is_far = innovation * innovation > gate * total
         # After several refusals in a row it is the surface that has moved: start anew.
         missed = np.where(seen[k], np.where(is_far, missed + 1.0, 0.0), missed)
-        lost = missed >= 5.0
+        lost = missed >= 3.0
         if lost.any():
             p00 = np.where(lost, _WIDE, p00)
             p01 = np.where(lost, 0.0, p01)
@@ -177,6 +175,4 @@ def _fused(z: F64, left: F64, right: F64) -> Smoothed:
     fused = lz + gain0 * dz + gain1 * ds
     variance = np.maximum(l00 - gain0 * l00 - gain1 * l01, 1e-12)
     seen = np.isfinite(z)
-    # Where the two sides exclude each other, the point belongs to neither for certain.
-    contradiction = seen & (dz * dz > 36.0 * np.maximum(s00, 1e-12)) & (r00 < 1.0) & (l00 < 1.0)
-    return Smoothed(np.where(seen, fused, np.nan), np.where(seen, np.sqrt(variance), np.nan), contradiction)
+    return Smoothed(np.where(seen, fused, np.nan), np.where(seen, np.sqrt(variance), np.nan))
