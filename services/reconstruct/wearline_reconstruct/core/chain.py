@@ -277,8 +277,7 @@ class _Measured:
 def _measured(found: Fragments, number: I64, spot_found: bool, prepared: Prepared) -> _Measured:
     calibration, recipe = prepared.calibration, prepared.recipe
     lines, along_size = calibration.across0_px.shape
-    keep = np.flatnonzero(number != NONE)
-    keep = keep[_one_each(number[keep], found, keep, along_size)]
+    keep = _one_each(number, found, (lines, along_size))
     line, along = number[keep], found.peaks.along[keep].astype(np.int64)
     across = found.peaks.across_px[keep].astype(np.float64)
     z = heights(calibration, line, along, across)
@@ -320,7 +319,6 @@ def _measured(found: Fragments, number: I64, spot_found: bool, prepared: Prepare
         row, col = (along, across) if calibration.is_vertical else (across, along)
         good &= (col >= x) & (col < x + width) & (row >= y) & (row < y + height)
     order = np.flatnonzero(good)
-    order = order[np.lexsort((along[order], line[order]))]
     row, col = (along, across) if calibration.is_vertical else (across, along)
     points = np.stack([line[order], row[order], col[order], z[order], sigma[order]], axis=1).astype(np.float32)
     expected = prepared.expected
@@ -338,23 +336,22 @@ def _measured(found: Fragments, number: I64, spot_found: bool, prepared: Prepare
     return _Measured(points, common, coverage, quality)
 
 
-def _one_each(number: I64, found: Fragments, keep: I64, along_size: int) -> I64:
-    """Indices into ``keep``: where two peaks claim one place of a line, the stronger."""
-    place = number * along_size + found.peaks.along[keep]
-    times = np.bincount(place)
-    if times.max(initial=0) <= 1:
-        return np.arange(len(keep))
-    order = np.lexsort((-found.peaks.signal_dn[keep], place))
-    ordered = place[order]
-    first = np.ones(len(order), bool)
-    first[1:] = ordered[1:] != ordered[:-1]
-    return np.sort(order[first])
+def _one_each(number: I64, found: Fragments, shape: tuple[int, int]) -> I64:
+    """Peaks with a number, ordered by line, then along; where two claim one place, the stronger."""
+    named = np.flatnonzero(number != NONE)
+    place = number[named] * shape[1] + found.peaks.along[named]
+    if np.bincount(place, minlength=1).max() > 1:
+        rising = np.argsort(found.peaks.signal_dn[named], kind="stable")
+        named, place = named[rising], place[rising]
+    owner = np.full(shape[0] * shape[1], -1)
+    owner[place] = named
+    return owner[owner >= 0]
 
 
 def _texture_px(found: Fragments, keep: I64, prepared: Prepared) -> F64:
     """Error of each position by the surface's streaks: that of the calibration's plates, and more in ambient light. [px]"""
     meta = prepared.calibration.meta
-    gain = 2.0 * prepared.scale.width_px
+    gain = 4.0 * prepared.scale.width_px
     base = float(meta.get("texture_px", 0.0))
     ambient_then = gain * float(meta.get("noise_dn", 0.0)) / max(float(meta.get("signal_dn", 1.0)), 1.0)
     steady = np.sqrt(max(base**2 - ambient_then**2, 0.0))

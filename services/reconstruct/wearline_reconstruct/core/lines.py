@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -75,7 +76,7 @@ def _smeared_ends(peaks: Peaks, label: I64, reach: int) -> Bool:
     end = np.append(end, peaks.along[-1:])[number]
     size = int(peaks.along.max(initial=0))
     from_begin, to_end = peaks.along - begin, end - peaks.along
-    return ((from_begin < reach) & (begin > reach)) | ((to_end < reach) & (end < size - reach))
+    return np.asarray(((from_begin < reach) & (begin > reach)) | ((to_end < reach) & (end < size - reach)))
 
 
 def _tracks(peaks: Peaks, scale: Scale, settings: LineSettings) -> I64:
@@ -147,12 +148,16 @@ def _longer(peaks: Peaks, label: I64, shortest: int) -> tuple[I64, I64]:
     """Order by label, then along, without labels that hold fewer peaks; labels counted from 0."""
     if not len(label):
         return np.zeros(0, np.int64), label
-    _, number, count = np.unique(label, return_inverse=True, return_counts=True)
-    keep = count[number] >= shortest
-    kept = np.flatnonzero(keep)
-    order = kept[np.lexsort((peaks.along[kept], number[kept]))]
-    dense = number[order]
-    return order, np.cumsum(np.concatenate([[0], np.diff(dense) != 0])[: len(dense)]).astype(np.int64)
+    count = np.bincount(label)
+    is_long = count >= shortest
+    number = np.cumsum(is_long) - 1
+    kept = np.flatnonzero(is_long[label])
+    dense = number[label[kept]]
+    # Peaks come ordered along the lines, so that a stable sort by label is enough; 16 bit sort in linear time.
+    if len(dense) and dense.max() < 2**16:
+        dense = dense.astype(np.uint16)
+    order = kept[np.argsort(dense, kind="stable")]
+    return order, number[label[order]]
 
 
 def position_noise(peaks: Peaks, label: I64, scale: Scale, average_px: int) -> tuple[F32, float]:
@@ -161,7 +166,7 @@ def position_noise(peaks: Peaks, label: I64, scale: Scale, average_px: int) -> t
     Third differences over a distance at which errors are independent cancel any smooth shape up to
     a parabola. Their spread, in classes of signal, gives ``v = v_speckle + v_noise / signal^2``.
     """
-    lag = average_px + max(3, int(round(1.2 * scale.width_px)))
+    lag = average_px + max(3, round(1.2 * scale.width_px))
     n = len(label)
     fallback = 0.06 * scale.width_px
     if n <= 3 * lag:
@@ -172,6 +177,8 @@ def position_noise(peaks: Peaks, label: I64, scale: Scale, average_px: int) -> t
     if len(third) < 60:
         return np.full(n, fallback, np.float32), float(lag)
     signal = peaks.signal_dn[lag : n - 2 * lag][same].astype(np.float64)
+    step = max(1, len(third) // 8000)
+    third, signal = third[::step], signal[::step]
     edges = np.percentile(signal, np.linspace(0, 100, 7))
     rows, values = [], []
     for low, high in zip(edges[:-1], edges[1:], strict=True):
@@ -227,7 +234,7 @@ def _breaks(peaks: Peaks, label: I64, sigma: F32, length: float, limit: float) -
     """Where a new fragment starts within one (jump), and which peaks lie within the smear of a jump."""
     n = len(label)
     broken, doubtful = np.zeros(n, bool), np.zeros(n, bool)
-    m, guard = max(12, int(round(2.0 * length))), max(2, int(round(0.45 * length)))
+    m, guard = max(12, round(2.0 * length)), max(2, round(0.45 * length))
     if n <= 2 * (m + guard) + 1:
         return broken, doubtful
     y = peaks.across_px.astype(np.float64)
@@ -252,8 +259,7 @@ def _breaks(peaks: Peaks, label: I64, sigma: F32, length: float, limit: float) -
     excess = np.where(whole, np.abs(jump) / np.sqrt(variance), 0.0)
     # Bends give smooth, broad excess; a jump stands out as a local maximum.
     span = guard + m // 2
-    padded = np.pad(excess, span)
-    highest = np.lib.stride_tricks.sliding_window_view(padded, 2 * span + 1).max(axis=1)
+    highest = cv2.dilate(excess[None], np.ones((1, 2 * span + 1), np.uint8))[0]
     peak = np.flatnonzero((excess > limit) & (excess >= highest) & (np.abs(jump) > 0.35))
     if not len(peak):
         return broken, doubtful

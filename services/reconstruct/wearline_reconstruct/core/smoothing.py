@@ -6,8 +6,8 @@ which is the Rauch-Tung-Striebel result in the two-filter form, and does not dep
 direction of sweep. Both run at once on all lines, cut into pieces that overlap by more than the filter's memory,
 so that a step of the recursion handles some hundred lanes.
 
-Steps stay sharp: filters start anew where a line was broken, and a single point that contradicts the
-prediction (innovation gate) does not enter.
+Steps stay sharp: filters start anew where a line was broken. A single point that contradicts the
+prediction hardly enters (innovation gate).
 """
 
 from __future__ import annotations
@@ -22,13 +22,14 @@ from wearline_reconstruct.core.stripes import F64, Bool
 
 _PIECES = 8
 _WIDE = 1e6
+_NOTHING = 1e15
 
 
 class SmoothingSettings(Settings):
     """How strongly heights are smoothed along a line."""
 
     gate_sigma: float = 6.0
-    """A point further off the prediction than this many standard deviations does not enter."""
+    """A point further off the prediction than this many standard deviations counts less and less."""
     overlap_px: int = 64
     """Run-in of each piece; longer than the memory of the filter. [px]"""
 
@@ -66,11 +67,10 @@ def smooth(
     forward = _lanes(z_mm, variance, process_mm2, starts, span, run_in)
     backward = _lanes(z_mm[:, ::-1], variance[:, ::-1], process_mm2[:, ::-1], ends[:, ::-1], span, run_in)
     both = (np.concatenate([f, b], axis=1) for f, b in zip(forward, backward, strict=True))
-    state = _filter(*both, gate=settings.gate_sigma**2, run_in=run_in)
-    half = state.shape[2] // 2
     # Filtered from the left, predicted from the right: each point counts once.
-    left = _whole(state[0:5, :, :half], lines, span, size)
-    right = _whole(state[5:10, :, half:], lines, span, size)[:, :, ::-1]
+    filtered, predicted = _filter(*both, gate=settings.gate_sigma**2, run_in=run_in)
+    left = _whole(filtered, lines, span, size)
+    right = _whole(predicted, lines, span, size)[:, :, ::-1]
     return _fused(z_mm, left, right)
 
 
@@ -101,57 +101,56 @@ def _lanes(
     return cut(z, np.nan), cut(variance, np.inf), cut(process, 0.0), cut(starts, False)  # type: ignore[return-value]
 
 
-def _filter(z: F64, variance: F64, process: F64, starts: Bool, *, gate: float, run_in: int) -> F64:
-    """Filtered (z, slope, p00, p01, p11), then the same predicted: (10, span, lane)."""
+def _filter(z: F64, variance: F64, process: F64, starts: Bool, *, gate: float, run_in: int) -> tuple[F64, F64]:
+    """(z, slope, p00, p01, p11) as (5, span, lane): filtered of the first half of the lanes, predicted of the second."""
     steps, lanes = z.shape
-    out = np.empty((10, steps - run_in, lanes))
+    half = lanes // 2
+    filtered = np.empty((steps - run_in, 5, half))
+    predicted = np.empty((steps - run_in, 5, lanes - half))
     seen = np.isfinite(z)
     value = np.where(seen, z, 0.0)
-    finite_variance = np.where(seen, variance, 1.0)
+    # A point that is not there weighs nothing.
+    noise = np.where(seen, variance, _NOTHING)
+    third, second = process / 3.0, process / 2.0
     any_start = starts.any(axis=1)
-    height, slope = np.zeros(lanes), np.zeros(lanes)
-    p00, p01, p11 = np.full(lanes, _WIDE), np.zeros(lanes), np.full(lanes, 1.0)
-    missed = np.zeros(lanes)
+    state = np.zeros((5, lanes))
+    height, slope, p00, p01, p11 = state
+    p00[:], p11[:] = _WIDE, 1.0
+    innovation, total, gain, g0, g1 = np.empty((5, lanes))
     for k in range(steps):
-        q11 = process[k]
-        height = height + slope
-        p00 = p00 + 2.0 * p01 + p11 + q11 / 3.0
-        p01 = p01 + p11 + 0.5 * q11
-        p11 = p11 + q11
+        height += slope
+        p00 += p01
+        p01 += p11
+        p00 += p01
+        p00 += third[k]
+        p01 += second[k]
+        p11 += process[k]
         if any_start[k]:
             fresh = starts[k]
-            p00 = np.where(fresh, _WIDE, p00)
-            p01 = np.where(fresh, 0.0, p01)
-            p11 = np.where(fresh, 1.0, p11)
+            p00[fresh], p01[fresh], p11[fresh] = _WIDE, 0.0, 1.0
         if k >= run_in:
-            now = out[:, k - run_in]
-            now[5], now[6], now[7], now[8], now[9] = height, slope, p00, p01, p11
-        innovation = value[k] - height
-        total = p00 + finite_variance[k]
-        is_far = innovation * innovation > gate * total
-        # After several refusals in a row it is the surface that has moved: start anew.
-        missed = np.where(seen[k], np.where(is_far, missed + 1.0, 0.0), missed)
-        lost = missed >= 3.0
-        if lost.any():
-            p00 = np.where(lost, _WIDE, p00)
-            p01 = np.where(lost, 0.0, p01)
-            p11 = np.where(lost, 1.0, p11)
-            missed = np.where(lost, 0.0, missed)
-            total = p00 + finite_variance[k]
-            is_far = is_far & ~lost
-        use = seen[k] & ~is_far
-        gain = np.where(use, 1.0 / total, 0.0)
-        g0, g1 = p00 * gain, p01 * gain
-        height = height + g0 * innovation
-        slope = slope + g1 * innovation
-        p11 = p11 - g1 * p01
-        p01 = p01 - g0 * p01
-        p00 = p00 - g0 * p00
-        # Rounding must not make a nearly known height negative after a wide start.
-        p00 = np.maximum(p00, 1e-16)
+            predicted[k - run_in] = state[:, half:]
+        np.subtract(value[k], height, out=innovation)
+        np.add(p00, noise[k], out=total)
+        # gain = 1 / max(total, innovation^2 / gate): what is too far off counts less, the further the less.
+        np.multiply(innovation, innovation, out=gain)
+        gain /= gate
+        np.maximum(gain, total, out=gain)
+        np.divide(1.0, gain, out=gain)
+        np.multiply(p00, gain, out=g0)
+        np.multiply(p01, gain, out=g1)
+        np.multiply(g0, innovation, out=total)
+        height += total
+        innovation *= g1
+        slope += innovation
+        g1 *= p01
+        p11 -= g1
+        np.subtract(1.0, g0, out=g0)
+        p01 *= g0
+        p00 *= g0
         if k >= run_in:
-            now[0], now[1], now[2], now[3], now[4] = height, slope, p00, p01, p11
-    return out
+            filtered[k - run_in] = state[:, :half]
+    return filtered.transpose(1, 0, 2), predicted.transpose(1, 0, 2)
 
 
 def _whole(state: F64, lines: int, span: int, size: int) -> F64:

@@ -117,7 +117,7 @@ def _measured_scale(sample: F32, width: float, pitch: float) -> tuple[float, flo
     near = cv2.blur(sample, (_odd(width), 1))
     rise = near - cv2.blur(sample, (window, 1))
     level = 4.0 * _background_noise(rise, near, width)
-    where, start, stop = _runs(rise > max(level, 0.02 * float(np.ptp(rise))))
+    where, start, stop = _runs((rise > max(level, 0.02 * float(np.ptp(rise)))).astype(np.uint8))
     found = _period(rise, width)
     if len(start) < 8:
         return width, found
@@ -165,7 +165,7 @@ def _period(rise: F32, width: float) -> float:
 
 
 def _odd(size: float) -> int:
-    return 2 * max(int(round(0.5 * (size - 1.0))), 0) + 1
+    return 2 * max(round(0.5 * (size - 1.0)), 0) + 1
 
 
 def _averaged(strip: Image, size: int) -> F32:
@@ -178,7 +178,7 @@ def _background_noise(rise: Image, near: Image, width: float) -> float:
     ``near`` is the averaged image, ``rise`` what it has above its local mean; second differences
     across the lines, where nothing rises, cancel a slope of the ambient light.
     """
-    lag = max(2, int(round(1.5 * width)))
+    lag = max(2, round(1.5 * width))
     low = rise[:, :-2 * lag], rise[:, lag:-lag], rise[:, 2 * lag :]
     dark = (low[0] <= 0.0) & (low[1] <= 0.0) & (low[2] <= 0.0)
     if int(dark.sum()) < 50:
@@ -189,15 +189,14 @@ def _background_noise(rise: Image, near: Image, width: float) -> float:
     return max(float(np.median(np.abs(second))) / (0.6745 * 1.2247), 0.15)
 
 
-def _runs(mask: Bool) -> tuple[I64, I64, I64]:
-    """Runs of True along the last axis: row, first and one past last."""
-    closed = mask.astype(np.uint8) if mask.dtype != np.uint8 else mask
-    closed[:, 0] = 0
-    closed[:, -1] = 0
-    flat = closed.reshape(-1)
+def _runs(mask: NDArray[np.uint8]) -> tuple[I64, I64, I64]:
+    """Runs of what is not 0 along the last axis: row, first and one past last. Blanks the first and last column."""
+    mask[:, 0] = 0
+    mask[:, -1] = 0
+    flat = mask.reshape(-1)
     edges = np.flatnonzero(flat[1:] != flat[:-1]) + 1
     start, stop = edges[0::2], edges[1::2]
-    row = start // mask.shape[1]
+    row = start // mask.shape[1]  # a run never crosses rows: their ends are blank
     base = row * mask.shape[1]
     return row, start - base, stop - base
 
@@ -218,11 +217,8 @@ def stripe_peaks(
     sparse = near[::23].astype(np.float32)
     noise = _background_noise(sparse - around[::23], sparse, scale.width_px)
     offset = max(settings.threshold_noise * noise, settings.threshold_dn)
-    if strip.dtype == np.uint8:
-        mask = cv2.compare(cv2.subtract(near, int(np.ceil(offset))), around, cv2.CMP_GT)
-    else:
-        mask = cv2.compare(near - np.float32(offset), around, cv2.CMP_GT)
-    along, start, stop = _runs(mask)
+    _, mask = cv2.threshold(cv2.subtract(near, around), offset, 255, cv2.THRESH_BINARY)
+    along, start, stop = _runs(np.asarray(mask).astype(np.uint8, copy=False))
     long_enough = stop - start >= max(2, int(0.8 * scale.width_px))
     along, start, stop = along[long_enough], start[long_enough], stop[long_enough]
     noise_dn = float(noise)
@@ -283,19 +279,17 @@ def _refined(
     flank = max(2, min(4, int(0.5 * pitch) - core))
     half = core + flank
     across = summed.shape[1]
-    inside = (seed >= core) & (seed < across - core)
+    inside = (seed >= half) & (seed < across - half)
     along, seed = along[inside], seed[inside]
     n = len(seed)
     out = np.empty((5, n), np.float32)
-    offset = np.arange(-half, half + 1)
-    x = offset.astype(np.float32)
-    flat = summed.reshape(-1)
+    x = np.arange(-half, half + 1, dtype=np.float32)
+    # Each row of this view is the window that begins there; taking rows copies neighbouring pixels at once.
+    windows = np.lib.stride_tricks.sliding_window_view(summed.reshape(-1), 2 * half + 1)
+    begin = along * across + seed - half
     for first in range(0, n, _CHUNK):
         part = slice(first, min(first + _CHUNK, n))
-        # Beyond the picture's edge the last pixel stands in; such peaks keep one good flank.
-        index = np.minimum(np.maximum(seed[part, None] + offset, 0), across - 1)
-        index += (along[part] * across)[:, None]
-        window = flat.take(index).astype(np.float32)
+        window = windows[begin[part]].astype(np.float32)
         window *= share
         _refine_chunk(window, x, core, flank, width, noise_dn, out[:, part])
     shift, signal, spread, low, top = out
@@ -351,7 +345,7 @@ def _refine_chunk(
         distance *= root
         total = distance @ ones
         np.maximum(total, 1e-6, out=total)
-        shift = (distance @ xi) / total
+        shift = np.asarray((distance @ xi) / total, np.float32)
         np.clip(shift, 1 - core, core - 1, out=shift)
     second = (distance @ (xi * xi)) / total - shift * shift
     out[0], out[3], out[4] = shift, middle, top
