@@ -304,13 +304,13 @@ def _measured(found: Fragments, number: I64, spot_found: bool, prepared: Prepare
     label[line, along] = found.label[keep]
     starts = _piece_starts(label, grid_z)
     point = slope * np.sqrt(fast**2 + texture**2)
-    process = _process_noise(grid_z, float(np.median(point)), grid_sigma)
+    process = _process_noise(grid_z, float(np.median(point[::9])), grid_sigma)
     smoothed = smooth(grid_z, grid_sigma, starts, 1.0, process, prepared.settings.smoothing)
     z_raw, z = z, smoothed.z_mm[line, along]
-    missed = _misfit(grid_z - smoothed.z_mm, float(np.median(slope * fast)), length)[line, along]
+    missed = _misfit(grid_z - smoothed.z_mm, float(np.median((slope * fast)[::9])), length)[line, along]
     posterior = np.hypot(np.minimum(smoothed.sigma_mm[line, along], point), missed)
     is_rejected = np.abs(z_raw - z) > 6.0 * np.hypot(point, missed)
-    vibration = float(calibration.meta.get("vibration_px", 0.05)) * float(np.median(slope)) if len(slope) else 0.0
+    vibration = float(calibration.meta.get("vibration_px", 0.05)) * float(np.median(slope[::9])) if len(slope) else 0.0
     common = float(np.hypot(vibration, float(calibration.meta.get("z_sigma_common_mm", 0.0))))
     sigma = np.sqrt(posterior**2 + calibration.z_sigma_mm[line, along] ** 2 + vibration**2)
     good = np.isfinite(z) & np.isfinite(sigma) & ~is_rejected
@@ -330,7 +330,7 @@ def _measured(found: Fragments, number: I64, spot_found: bool, prepared: Prepare
             "shows no measurable point in the region of interest", cure="check the recipe's roi and the part",
             code=int(ResultCode.COVERAGE),
         )  # fmt: skip
-    seen = len(np.unique(line[order]))
+    seen = int(np.count_nonzero(np.bincount(line[order])))
     wanted = int((expected.sum(axis=1) > 0.1 * along_size).sum())
     quality = describe(found, seen, max(wanted, seen), spot_found, calibration.stripe_width_px, coverage)
     return _Measured(points, common, coverage, quality)
@@ -381,7 +381,7 @@ def _process_noise(z: F64, point_mm: float, sigma: F64) -> F64:
 
     Third differences of a surface whose slope is a random walk have the variance q lag^3.
     """
-    usual = float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else 0.0
+    usual = float(np.nanmedian(sigma[:, ::9])) if np.isfinite(sigma[:, ::9]).any() else 0.0
     process = np.full(z.shape, usual**2 / _LONGEST_PX**4)
     for lag in _LAGS:
         if z.shape[1] <= 4 * lag:

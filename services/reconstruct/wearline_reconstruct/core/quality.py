@@ -53,9 +53,9 @@ def describe(
     """Figures and plain sentences."""
     peaks = found.peaks
     saturated = float(np.mean(peaks.is_saturated)) if len(peaks) else 0.0
-    width = float(np.median(peaks.width_px)) if len(peaks) else None
-    contrast = float(np.median(peaks.signal_dn)) if len(peaks) else 0.0
-    ambient = float(np.median(peaks.background_dn)) if len(peaks) else 0.0
+    width = float(np.median(peaks.width_px[::9])) if len(peaks) else None
+    contrast = float(np.median(peaks.signal_dn[::9])) if len(peaks) else 0.0
+    ambient = float(np.median(peaks.background_dn[::9])) if len(peaks) else 0.0
     sentences = []
     if numbered_lines < lines:
         sentences.append(f"{lines - numbered_lines} of {lines} lines were not seen.")
