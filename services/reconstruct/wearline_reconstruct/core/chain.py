@@ -212,6 +212,7 @@ def _numbered(strip: Image, found: Fragments, prepared: Prepared) -> tuple[I64, 
         number = number_by_gate(found, prepared.gate)
         spot = _check_against_template(number, found, spots, prepared.gate, prepared)
         return number, spot
+    spots = _spots_in_range(spots, prepared)
     numbers = number_fragments(
         found, calibration, pitch, spots, prepared.recipe.line_constraints, prepared.settings.numbering
     )
@@ -227,7 +228,56 @@ def _numbered(strip: Image, found: Fragments, prepared: Prepared) -> tuple[I64, 
             cure="check that the part lies in the calibrated range and that this is the calibrated head",
             code=int(ResultCode.COVERAGE),
         )  # fmt: skip
-    return numbers.number[found.label], spots[0] if spots else None
+    number = numbers.number[found.label]
+    if not spots and not prepared.recipe.line_constraints:
+        _check_whole_comb(found, numbers.number, calibration)
+    return number, spots[0] if spots else None
+
+
+_CLEAR_SPOT = 1.0
+"""Light of a spot, as a multiple of its line's, that no piece of line or texture shows."""
+
+
+def _spots_in_range(spots: list[Spot], prepared: Prepared) -> list[Spot]:
+    """Spots at a height that the middle line may have, the strongest first.
+
+    Raises:
+        FrameError: a clear spot lies outside the calibrated range (22).
+    """
+    if not spots:
+        return spots
+    calibration = prepared.calibration
+    low, high = calibration.z_range_mm
+    middle = calibration.lines // 2
+    places = np.array([np.clip(round(s.along_px), 0, calibration.across0_px.shape[1] - 1) for s in spots], np.int64)
+    z = heights(calibration, np.full(len(spots), middle), places, np.array([s.across_px for s in spots]))
+    reserve = 0.1 * prepared.scale.pitch_px * float(np.nanmedian(np.abs(calibration.a_mm_per_px[:, ::16])))
+    inside = [s for s, height in zip(spots, z, strict=True) if low - reserve <= height <= high + reserve]
+    if spots[0].excess > _CLEAR_SPOT and (not inside or inside[0].excess < 0.3 * spots[0].excess):
+        raise FrameError(
+            f"lies at about {z[0]:.1f} mm by the centre spot, outside the calibrated {low:.2f} to {high:.2f} mm",
+            cure="check the part's position or calibrate a larger range", code=int(ResultCode.REGISTRATION),
+        )  # fmt: skip
+    return inside
+
+
+def _check_whole_comb(found: Fragments, number: I64, calibration: Calibration) -> None:
+    """Without a spot the comb must fit from end to end: else all numbers may be shifted alike.
+
+    Raises:
+        FrameError: 12.
+    """
+    size = np.bincount(found.label)
+    signal = np.bincount(found.label, weights=found.peaks.signal_dn) / size
+    left = (number == NONE) & (signal > 0.4 * float(np.median(found.peaks.signal_dn)))
+    known = np.flatnonzero(np.isfinite(calibration.across0_px).any(axis=1))
+    has_ends = np.isin(known[[0, -1]], number).all()
+    if int(size[left].sum()) > 0.3 * float(size.max()) or not has_ends:
+        raise FrameError(
+            "shows no centre spot, and the lines alone do not settle their numbers",
+            cure="uncover the spot, check the part's position, or mark lines with line_constraints in the recipe",
+            code=int(ResultCode.COVERAGE),
+        )  # fmt: skip
 
 
 def _check_against_template(
@@ -247,7 +297,7 @@ def _check_against_template(
         off = spot.across_px - float(np.nanmedian(near))
         if abs(off) < 0.55 * pitch:
             return spot
-        if spot.excess > 1.0:
+        if spot.excess > _CLEAR_SPOT:
             raise FrameError(
                 f"shows the centre spot {abs(off) / pitch:.1f} line distances from where the template has it",
                 cure="check the part's position and that the template belongs to it", code=int(ResultCode.REGISTRATION),
