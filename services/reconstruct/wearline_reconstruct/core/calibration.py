@@ -525,4 +525,8 @@ def _with_spot(draft: Calibration, pictures: Sequence[PlaneLines], heights: F64)
     place = int(np.clip(round(at), 0, draft.across0_px.shape[1] - 1))
     across = float(across_at(draft, 0.0)[draft.lines // 2, place])
     spot = np.array([at, across]) if draft.is_vertical else np.array([across, at])
-    return replace(draft, spot_px=spot, meta={**draft.meta, "spot_along_px_per_mm": round(float(fit[0]), 5)})
+    excess = float(np.median([s.excess for _, s in found]))
+    drift = round(float(fit[0]), 5)
+    return replace(
+        draft, spot_px=spot, meta={**draft.meta, "spot_along_px_per_mm": drift, "spot_excess": round(excess, 3)}
+    )

@@ -161,7 +161,9 @@ def _spot_search(calibration: Calibration, pitch: float) -> Search | None:
     drift = max(abs(float(calibration.meta.get("spot_along_px_per_mm", 0.0)) * z) for z in calibration.z_range_mm)
     # A part lower or higher than the range must be seen as such, not lost.
     return Search(
-        (along - drift - pitch, along + drift + pitch), (min(places) - 1.2 * pitch, max(places) + 1.2 * pitch)
+        (along - drift - pitch, along + drift + pitch),
+        (min(places) - 1.2 * pitch, max(places) + 1.2 * pitch),
+        0.4 * float(calibration.meta.get("spot_excess", 1.0)),
     )
 
 
@@ -234,8 +236,8 @@ def _numbered(strip: Image, found: Fragments, prepared: Prepared) -> tuple[I64, 
     return number, spots[0] if spots else None
 
 
-_CLEAR_SPOT = 1.0
-"""Light of a spot, as a multiple of its line's, that no piece of line or texture shows."""
+_CLEAR_SPOT = 1.5
+"""Excess of a spot that cannot be anything else, as a multiple of the least."""
 
 
 def _spots_in_range(spots: list[Spot], prepared: Prepared) -> list[Spot]:
@@ -253,7 +255,8 @@ def _spots_in_range(spots: list[Spot], prepared: Prepared) -> list[Spot]:
     z = heights(calibration, np.full(len(spots), middle), places, np.array([s.across_px for s in spots]))
     reserve = 0.1 * prepared.scale.pitch_px * float(np.nanmedian(np.abs(calibration.a_mm_per_px[:, ::16])))
     inside = [s for s, height in zip(spots, z, strict=True) if low - reserve <= height <= high + reserve]
-    if spots[0].excess > _CLEAR_SPOT and (not inside or inside[0].excess < 0.3 * spots[0].excess):
+    least = prepared.search.least_excess if prepared.search else 1.0
+    if spots[0].excess > _CLEAR_SPOT * least and (not inside or inside[0].excess < 0.3 * spots[0].excess):
         raise FrameError(
             f"lies at about {z[0]:.1f} mm by the centre spot, outside the calibrated {low:.2f} to {high:.2f} mm",
             cure="check the part's position or calibrate a larger range", code=int(ResultCode.REGISTRATION),
@@ -297,7 +300,7 @@ def _check_against_template(
         off = spot.across_px - float(np.nanmedian(near))
         if abs(off) < 0.55 * pitch:
             return spot
-        if spot.excess > _CLEAR_SPOT:
+        if prepared.search is not None and spot.excess > _CLEAR_SPOT * prepared.search.least_excess:
             raise FrameError(
                 f"shows the centre spot {abs(off) / pitch:.1f} line distances from where the template has it",
                 cure="check the part's position and that the template belongs to it", code=int(ResultCode.REGISTRATION),

@@ -32,6 +32,8 @@ class Search:
 
     along_px: tuple[float, float]
     across_px: tuple[float, float]
+    least_excess: float = _LEAST_EXCESS
+    """Weaker ones are not the spot of this head."""
 
 
 def find_spots(strip: Image, scale: Scale, search: Search | None = None, most: int = 4) -> list[Spot]:
@@ -54,16 +56,21 @@ def find_spots(strip: Image, scale: Scale, search: Search | None = None, most: i
     line_light = float(np.percentile((light - cv2.blur(ambient, (period, length)))[::3, ::4], 70))
     sparse = excess[::3, ::3]
     noise = float(np.median(np.abs(sparse - np.median(sparse)))) / 0.6745
-    least = max(_LEAST_EXCESS * line_light, _LEAST_NOISE * noise, 0.1)
-    allowed = np.zeros(excess.shape, np.uint8)
-    if search is None:
-        allowed[:] = 1
-    else:
+    share = _LEAST_EXCESS if search is None else search.least_excess
+    least = max(share * line_light, _LEAST_NOISE * noise, 0.1)
+    # The flank of something bright outside the search is no spot inside it.
+    is_top = np.asarray(excess >= cv2.dilate(excess, np.ones((3, 3), np.uint8)))
+    allowed = is_top.astype(np.uint8)
+    if search is not None:
+        inside = np.zeros_like(allowed)
         a0, a1 = (int(v / _SHRINK) for v in search.along_px)
         c0, c1 = (int(v / _SHRINK) for v in search.across_px)
-        allowed[max(a0, 0) : max(a1 + 1, 0), max(c0, 0) : max(c1 + 1, 0)] = 1
+        inside[max(a0, 0) : max(a1 + 1, 0), max(c0, 0) : max(c1 + 1, 0)] = 1
+        allowed &= inside
     found: list[Spot] = []
     for _ in range(most):
+        if not allowed.any():
+            break
         _, value, _, (across, along) = cv2.minMaxLoc(excess, allowed)
         if value < least:
             break
