@@ -273,8 +273,10 @@ def _refined(
     strength = summed[along, seed].astype(np.float32) * share
     strength -= np.float32(np.percentile(summed[::32, ::5], 30)) * share
     ratio = noise_dn / max(float(np.median(strength)), 1.0) if len(seed) else 1.0
-    # In the dark the tails carry the best part of what speckle leaves; in bright light, its texture.
-    reach = float(np.interp(ratio, (0.01, 0.04), (3.1, 2.4)))
+    # In the dark the tails carry the best part of what speckle leaves; in bright light they carry the
+    # texture of the background, and only what stands clear of it counts.
+    reach = float(np.interp(ratio, (0.008, 0.025), (3.1, 2.4)))
+    floor = float(np.interp(ratio, (0.008, 0.025), (0.0, 0.3)))
     core = int(np.ceil(min(reach * width + 0.5, 0.5 * pitch)))
     flank = max(2, min(4, int(0.5 * pitch) - core))
     half = core + flank
@@ -291,7 +293,7 @@ def _refined(
         part = slice(first, min(first + _CHUNK, n))
         window = windows[begin[part]].astype(np.float32)
         window *= share
-        _refine_chunk(window, x, core, flank, width, noise_dn, out[:, part])
+        _refine_chunk(window, x, core, flank, width, noise_dn, floor, out[:, part])
     shift, signal, spread, low, top = out
     centre = seed.astype(np.float32) + shift
     good = (signal > 2.0 * noise_dn) & (np.abs(shift) < max(1.6 * width, 1.5)) & np.isfinite(centre)
@@ -309,7 +311,7 @@ def _refined(
 
 
 def _refine_chunk(
-    window: F32, x: F32, core: int, flank: int, width: float, noise_dn: float, out: F32
+    window: F32, x: F32, core: int, flank: int, width: float, noise_dn: float, floor: float, out: F32
 ) -> None:
     """Shift from the seed, signal, width, background and top of each window [n, 2 half + 1] into ``out`` [5, n]."""
     half = core + flank
@@ -327,7 +329,7 @@ def _refine_chunk(
     xi = x[flank:-flank]
     root = inner - middle[:, None]
     root -= ((right - left) / span)[:, None] * xi
-    root -= np.float32(2.0 * noise_dn)
+    root -= np.maximum(np.float32(floor) * (top - middle), np.float32(2.0 * noise_dn))[:, None]
     np.maximum(root, 0.0, out=root)
     np.sqrt(root, out=root)
     edge = np.float32(core)

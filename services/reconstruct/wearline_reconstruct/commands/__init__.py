@@ -264,7 +264,7 @@ def _configure_bench(parser: ArgumentParser) -> None:
 
 
 def _run_bench(arguments: Namespace) -> int:
-    from wearline_reconstruct.bench import run_bench
+    from wearline_reconstruct.commands.bench import run_bench
 
     if not 1 <= arguments.frames <= 1000:
         raise UsageError(f"{arguments.frames} frames cannot be", "--frames", "give 1 to 1000")
