@@ -63,7 +63,7 @@ def dense_map(
 
 
 def _fill(points: F32, is_vertical: bool, z_map: F32, sigma_map: F32) -> None:
-    along_size, across_size = z_map.shape
+    along_size = z_map.shape[0]
     line = np.rint(points[:, 0]).astype(np.int64)
     along = np.rint(points[:, 1 if is_vertical else 2]).astype(np.int64)
     inside = (along >= 0) & (along < along_size) & np.isfinite(points).all(axis=1) & (line >= 0)
@@ -96,7 +96,7 @@ def _steps(gap: F32, rise: F32, sigma: F32) -> NDArray[np.bool_]:
         usual = np.nanmedian(gap, axis=0, keepdims=True) if gap.size else gap
         moved = np.abs(gap - usual)
         floor = np.maximum(6.0 * np.maximum(sigma[1:], sigma[:-1]), 0.02)
-        return (size > _STEP_RATIO * beside + floor) & (moved > _STEP_SHARE * usual)
+        return np.asarray((size > _STEP_RATIO * beside + floor) & (moved > _STEP_SHARE * usual))
 
 
 def _tangents(gap: F32, slope: F32) -> F32:

@@ -66,9 +66,7 @@ class Comparison:
         return float(np.mean(self.error_mm))
 
 
-def compare(
-    found: Reconstruction, across_px: F64, z_mm: F64, is_vertical: bool, near_px: float = 6.0
-) -> Comparison:
+def compare(found: Reconstruction, across_px: F64, z_mm: F64, is_vertical: bool, near_px: float = 6.0) -> Comparison:
     """Truth (line, along) against what was found; a number is right if its line is within ``near_px``."""
     points: NDArray[np.float64] = found.points.astype(np.float64)
     line = points[:, 0].astype(int)
@@ -77,6 +75,4 @@ def compare(
     off = np.abs(across - across_px[line, place])
     right = off < near_px
     error = points[:, 3] - z_mm[line, place]
-    return Comparison(
-        error[right], points[right, 4], int((~right).sum()), float(right.sum() / np.isfinite(z_mm).sum())
-    )
+    return Comparison(error[right], points[right, 4], int((~right).sum()), float(right.sum() / np.isfinite(z_mm).sum()))

@@ -87,7 +87,7 @@ class Reconstruct(Service):
             known = self._recipe(frame)
             prepared = self._prepare(known)
             found = reconstruct(frame.pixels, prepared, time.perf_counter)
-        except _Refused as refused:
+        except _RefusedError as refused:
             return self._refusal(frame, int(refused.code), refused.text, known)
         except FrameError as error:
             return self._refusal(frame, error.code, str(error), known)
@@ -114,9 +114,9 @@ class Reconstruct(Service):
         try:
             answer = self._ask(RECIPE, AskRecipe(object_index=index), str(index))
         except BusError as error:
-            raise _Refused(_code_of(error, ResultCode.UNKNOWN_OBJECT), str(error)) from error
+            raise _RefusedError(_code_of(error, ResultCode.UNKNOWN_OBJECT), str(error)) from error
         if not isinstance(answer, ObjectRecipe):
-            raise _Refused(ResultCode.UNKNOWN_OBJECT, f"object {index} has no recipe")
+            raise _RefusedError(ResultCode.UNKNOWN_OBJECT, f"object {index} has no recipe")
         return answer
 
     def _prepare(self, known: ObjectRecipe) -> Prepared:
@@ -127,11 +127,13 @@ class Reconstruct(Service):
             return found
         name = f"object {known.object_index}"
         if not known.calibration_hash:
-            raise _Refused(ResultCode.NO_CALIBRATION, f"{name} has no calibration; make one with 'wearline calibrate'")
+            raise _RefusedError(
+                ResultCode.NO_CALIBRATION, f"{name} has no calibration; make one with 'wearline calibrate'"
+            )
         try:
             recipe = parse_recipe(known.recipe_yaml, f"recipe of {name}")
         except RecipeError as error:
-            raise _Refused(ResultCode.UNKNOWN_OBJECT, str(error)) from error
+            raise _RefusedError(ResultCode.UNKNOWN_OBJECT, str(error)) from error
         try:
             content = self._artifact(known.calibration_hash, ResultCode.NO_CALIBRATION)
             calibration = Calibration.from_bytes(content, f"calibration of {name}")
@@ -143,9 +145,9 @@ class Reconstruct(Service):
                     raise TemplateError("was made with another calibration", f"template of {name}", "teach it again")
             prepared = prepare(calibration, recipe, template, self._settings.chain)
         except CalibrationError as error:
-            raise _Refused(ResultCode.NO_CALIBRATION, str(error)) from error
+            raise _RefusedError(ResultCode.NO_CALIBRATION, str(error)) from error
         except TemplateError as error:
-            raise _Refused(ResultCode.NO_TEMPLATE, str(error)) from error
+            raise _RefusedError(ResultCode.NO_TEMPLATE, str(error)) from error
         self._prepared[key] = prepared
         while len(self._prepared) > _KEPT_OBJECTS:
             self._prepared.popitem(last=False)
@@ -158,10 +160,10 @@ class Reconstruct(Service):
         try:
             answer = self._ask(ARTIFACT, AskArtifact(content_hash=name), name)
         except BusError as error:
-            raise _Refused(_code_of(error, missing), str(error)) from error
+            raise _RefusedError(_code_of(error, missing), str(error)) from error
         content = answer.content.tobytes() if isinstance(answer, Artifact) else b""
         if content_hash(content) != name:
-            raise _Refused(missing, f"artifact {name[:12]} came with other content; restore it or make it again")
+            raise _RefusedError(missing, f"artifact {name[:12]} came with other content; restore it or make it again")
         self._cache.put(name, content)
         return content
 
@@ -196,7 +198,7 @@ class Reconstruct(Service):
         yield Event(service=self.name, level="warning", text=answer.refusal, utc=now, cycle_id=answer.cycle_id)
 
 
-class _Refused(Exception):
+class _RefusedError(Exception):
     """A frame that cannot be measured for a reason beside the frame."""
 
     def __init__(self, code: ResultCode, text: str) -> None:
@@ -210,7 +212,7 @@ def _code_of(error: WearlineError, refused: ResultCode) -> ResultCode:
 
 
 def _frame_hash(frame: Frame) -> str:
-    return hashlib.sha256(np.ascontiguousarray(frame.pixels)).hexdigest()
+    return hashlib.sha256(np.ascontiguousarray(frame.pixels).data).hexdigest()
 
 
 def build(cell: CellSettings, settings: ReconstructSettings) -> Service:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -73,7 +74,7 @@ def test_one_line_joined_over_a_gap_and_broken_at_a_jump() -> None:
     found = fragments(stripe_peaks(strip, scale, StripeSettings()), scale, 7, LineSettings())
     assert found.count == 6
     edges = found.first
-    ends = [(int(found.peaks.along[a]), int(found.peaks.along[b - 1])) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    ends = [(int(found.peaks.along[a]), int(found.peaks.along[b - 1])) for a, b in pairwise(edges)]
     for begin, end in ends:
         assert (begin < 5 and abs(end - 299) < 8) or (abs(begin - 300) < 8 and end > 630)
 
@@ -266,7 +267,10 @@ FLAT = np.full((480, 640), 60, np.uint8)
         (np.full((480, 640), 255, np.uint8), "white"),
         (FLAT, "even"),
         (np.random.default_rng(1).integers(0, 256, (480, 640)).astype(np.uint8), "noise|no laser lines|number"),
-        (np.clip(np.random.default_rng(2).normal(60, 5, (480, 640)), 0, 255).astype(np.uint8), "noise|no laser lines|even"),
+        (
+            np.clip(np.random.default_rng(2).normal(60, 5, (480, 640)), 0, 255).astype(np.uint8),
+            "noise|no laser lines|even",
+        ),
         (np.zeros((479, 640), np.uint8), "479"),
         (np.zeros((480, 640), np.uint16), "8-bit"),
         (np.zeros((480, 640, 3), np.uint8), "8-bit"),

@@ -120,7 +120,7 @@ def calibrate(
     _check_shifts(heights, pictures, shots, settings)
     rows, sigma = _blocks(pictures)
     along_size = pictures[0].across_px.shape[1]
-    centre = np.arange(rows.shape[2]) * _BLOCK + 0.5 * (_BLOCK - 1)
+    centre: F64 = np.arange(rows.shape[2]) * float(_BLOCK) + 0.5 * (_BLOCK - 1)
     u = _unit(centre, along_size)
     solution = _solve(heights, rows, sigma, u, settings.vibration_px, len(planes))
     _check_fit(heights, planes, solution, shots, settings)
@@ -129,6 +129,11 @@ def calibrate(
 
 def _unit(along: F64, size: int) -> F64:
     return np.asarray(2.0 * along / max(size - 1, 1) - 1.0)
+
+
+def _terms(u: F64, count: int) -> F64:
+    """Chebyshev polynomials at u in -1 .. 1: (place, term)."""
+    return np.asarray(np.polynomial.chebyshev.chebvander(u, count - 1), np.float64)
 
 
 def _check_shifts(
@@ -194,8 +199,8 @@ def _solve(heights: F64, rows: F64, sigma: F64, u: F64, vibration_px: float, pla
     """Gauss-Newton over all lines at once; unknowns: per line x1 and g terms, then b, then one offset per shot."""
     shots, lines, blocks = rows.shape
     terms, shared = _X1_TERMS + _G_TERMS, 1 + shots
-    bx = np.polynomial.chebyshev.chebvander(u, _X1_TERMS - 1)
-    bg = np.polynomial.chebyshev.chebvander(u, _G_TERMS - 1)
+    bx = _terms(u, _X1_TERMS)
+    bg = _terms(u, _G_TERMS)
     valid = np.isfinite(rows)
     h = heights[:, None]
     slope = _common_slope(heights, rows)
@@ -348,8 +353,8 @@ def _assemble(
 ) -> Calibration:  # fmt: skip
     along = np.arange(along_size, dtype=np.float64)
     u = _unit(along, along_size)
-    bx = np.polynomial.chebyshev.chebvander(u, _X1_TERMS - 1)
-    bg = np.polynomial.chebyshev.chebvander(u, _G_TERMS - 1)
+    bx = _terms(u, _X1_TERMS)
+    bg = _terms(u, _G_TERMS)
     x1 = solution.x1 @ bx.T
     g = solution.g @ bg.T
     x1 = x1 + _unmodelled(solution, along_size)

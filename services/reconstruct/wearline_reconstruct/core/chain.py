@@ -37,8 +37,8 @@ from wearline_reconstruct.core.stripes import (
     Image,
     Scale,
     StripeSettings,
-    stripe_peaks,
     strip_image,
+    stripe_peaks,
 )
 
 _STREAK_PX = 60.0
@@ -110,7 +110,7 @@ def prepare(
     if not np.isfinite(pitch) or pitch <= 0.0:
         raise CalibrationError("has no two neighbouring lines", "calibration", "calibrate again")
     scale = Scale(calibration.stripe_width_px, pitch)
-    along_size, across_size = _sizes(calibration)
+    across_size = _sizes(calibration)[1]
     gate = None
     expected = np.isfinite(calibration.across0_px) & np.isfinite(calibration.a_mm_per_px)
     if template is not None and template.line_across_px.shape == calibration.across0_px.shape:
@@ -202,7 +202,11 @@ def reconstruct(pixels: Image, prepared: Prepared, clock_s: Callable[[], float] 
     result = _measured(found, number, spot is not None, prepared)
     lap("heights")
     return Reconstruction(
-        result.points, result.sigma_frame_mm, result.coverage, result.quality, {**timings, "total": sum(timings.values())}
+        result.points,
+        result.sigma_frame_mm,
+        result.coverage,
+        result.quality,
+        {**timings, "total": sum(timings.values())},
     )
 
 
@@ -222,7 +226,8 @@ def _numbered(strip: Image, found: Fragments, prepared: Prepared) -> tuple[I64, 
         if prepared.search is not None and not spots:
             raise FrameError(
                 "shows no centre spot, and nothing else settles the line numbers",
-                cure="uncover the spot, or mark lines with line_constraints in the recipe", code=int(ResultCode.COVERAGE),
+                cure="uncover the spot, or mark lines with line_constraints in the recipe",
+                code=int(ResultCode.COVERAGE),
             )  # fmt: skip
         low, high = calibration.z_range_mm
         raise FrameError(
@@ -402,7 +407,7 @@ def _one_each(number: I64, found: Fragments, shape: tuple[int, int]) -> I64:
 
 
 def _texture_px(found: Fragments, keep: I64, prepared: Prepared) -> F64:
-    """Error of each position by the surface's streaks: that of the calibration's plates, and more in ambient light. [px]"""
+    """Error of each position by streaks of the surface: as on the plates, and more in ambient light. [px]"""
     meta = prepared.calibration.meta
     gain = 4.0 * prepared.scale.width_px
     base = float(meta.get("texture_px", 0.0))
@@ -445,9 +450,9 @@ def _process_noise(z: F64, point_mm: float, sigma: F64) -> F64:
         mean = cv2.blur(squared, (17, 1)) / np.maximum(cv2.blur(have.astype(np.float32), (17, 1)), 0.05)
         excess = np.maximum(mean - np.float32(2.5 * 20.0 * point_mm**2), 0.0) / lag**3
         # A bend lies anywhere within the reach of the difference that shows it.
-        excess = cv2.dilate(excess, np.ones((1, 2 * lag + 1), np.uint8))
+        widened = cv2.dilate(excess, np.ones((1, 2 * lag + 1), np.uint8))
         start = 3 * lag // 2
-        padded = np.pad(excess, ((0, 0), (start, z.shape[1] - excess.shape[1] - start)), mode="edge")
+        padded = np.pad(widened, ((0, 0), (start, z.shape[1] - widened.shape[1] - start)), mode="edge")
         np.maximum(process, padded, out=process)
     return process
 

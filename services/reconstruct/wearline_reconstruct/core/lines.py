@@ -8,6 +8,7 @@ the fragment ends, because what goes on beyond the jump may be another line.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -120,9 +121,7 @@ def _tracks(peaks: Peaks, scale: Scale, settings: LineSettings) -> I64:
         root = further
 
 
-def _nearest(
-    key: F64, along: I64, across: F64, wanted: I64, lag: int, stride: float, allowed: float
-) -> I64:
+def _nearest(key: F64, along: I64, across: F64, wanted: I64, lag: int, stride: float, allowed: float) -> I64:
     return _nearest_among(key, along, across, wanted, None, lag, stride, allowed)
 
 
@@ -181,7 +180,7 @@ def position_noise(peaks: Peaks, label: I64, scale: Scale, average_px: int) -> t
     third, signal = third[::step], signal[::step]
     edges = np.percentile(signal, np.linspace(0, 100, 7))
     rows, values = [], []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in pairwise(edges):
         chosen = (signal >= low) & (signal <= high)
         if chosen.sum() < 10:
             continue

@@ -122,7 +122,7 @@ class _Candidates:
 
     @property
     def slots(self) -> int:
-        return self.label.shape[1]
+        return int(self.label.shape[1])
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def number_fragments(
     follow = _neighbours_along(node, along, across, height, pitch_px, len(chosen))
     beside = _cross_sections(node, along, across, len(chosen))
     wall = -float(np.sign(a_usual))
-    alive = np.isfinite(calibration.across0_px).any(axis=1)
+    alive: Bool = np.asarray(np.isfinite(calibration.across0_px).any(axis=1))
     pairs = _neighbours_across(beside, height, _Rules(1.0, 0.6, 0.25, wall, alive))
     best, lead = _propagate(unary, (pairs, follow))
     if not _is_plain(best, pairs, candidates, calibration.lines):
@@ -357,9 +357,7 @@ def _is_plain(best: I64, pairs: _Pairs, candidates: _Candidates, lines: int) -> 
     return bool((pairs.cost[pairs.chosen(best)] < 0.3 * pairs.weight).all())
 
 
-def _neighbours_along(
-    node: I64, along: I64, across: F64, height: _Heights, pitch_px: float, count: int
-) -> _Pairs:
+def _neighbours_along(node: I64, along: I64, across: F64, height: _Heights, pitch_px: float, count: int) -> _Pairs:
     """Fragments that follow each other along the lines: the surface rather goes on at its height."""
     first = np.searchsorted(node, np.arange(count))
     last = np.append(first[1:], len(node)) - 1
@@ -404,7 +402,7 @@ def _propagate(unary: F64, groups: tuple[_Pairs, ...], turns: int = 60) -> tuple
     target = np.concatenate([second, first])
     # Cost as seen by each directed message: [message, slot of source, slot of target].
     towards = np.concatenate([cost, cost.transpose(0, 2, 1)])
-    count, labels = unary.shape
+    labels = unary.shape[1]
     edges = len(first)
     reverse = np.concatenate([np.arange(edges, 2 * edges), np.arange(edges)])
     message = np.zeros((2 * edges, labels), np.float32)
@@ -517,9 +515,7 @@ def _ordered(number: I64, lead: F64, node: I64, along: I64, across: F64) -> I64:
         wrong = (along[upper] == along[lower]) & (number[node[lower]] <= number[node[upper]])
         if not wrong.any():
             break
-        pair, weight = np.unique(
-            np.stack([node[upper[wrong]], node[lower[wrong]]]), axis=1, return_counts=True
-        )
+        pair, weight = np.unique(np.stack([node[upper[wrong]], node[lower[wrong]]]), axis=1, return_counts=True)
         a, b = pair[:, int(np.argmax(weight))]
         number[a if lead[a] < lead[b] else b] = NONE
     return number

@@ -54,12 +54,14 @@ def plane_lines(
     seen = np.unique(number[(number != _NONE) & (np.bincount(found.label) > 0.25 * along_size)])
     if len(seen) and (seen.min() < 0 or seen.max() >= lines):
         raise CalibrationError(
-            f"shows a line {abs(int(seen.min() if seen.min() < 0 else seen.max() - lines + 1))} beyond the {lines} lines"
+            f"shows {int(((seen < 0) | (seen >= lines)).sum())} lines beyond the {lines} lines"
             " when counted from the spot", where, "check --lines and that nothing else reflects the laser",
         )  # fmt: skip
     if len(seen) < max(3, int(0.6 * lines)):
         raise CalibrationError(
-            f"shows only {len(seen)} of {lines} lines", where, "the plate must fill the picture; check exposure and --lines"
+            f"shows only {len(seen)} of {lines} lines",
+            where,
+            "the plate must fill the picture; check exposure and --lines",
         )
     across = np.full((lines, along_size), np.nan)
     sigma = np.full((lines, along_size), np.nan)

@@ -102,7 +102,7 @@ def _lanes(
 
 
 def _filter(z: F64, variance: F64, process: F64, starts: Bool, *, gate: float, run_in: int) -> tuple[F64, F64]:
-    """(z, slope, p00, p01, p11) as (5, span, lane): filtered of the first half of the lanes, predicted of the second."""
+    """(z, slope, p00, p01, p11), each (5, span, lane): filtered for the first half of the lanes, predicted for the rest."""
     steps, lanes = z.shape
     half = lanes // 2
     filtered = np.empty((steps - run_in, 5, half))
@@ -112,7 +112,7 @@ def _filter(z: F64, variance: F64, process: F64, starts: Bool, *, gate: float, r
     # A point that is not there weighs nothing.
     noise = np.where(seen, variance, _NOTHING)
     third, second = process / 3.0, process / 2.0
-    any_start = starts.any(axis=1)
+    any_start: Bool = np.asarray(starts.any(axis=1))
     state = np.zeros((5, lanes))
     height, slope, p00, p01, p11 = state
     p00[:], p11[:] = _WIDE, 1.0

@@ -46,10 +46,10 @@ def find_spots(strip: Image, scale: Scale, search: Search | None = None, most: i
     small = cv2.resize(strip, None, fx=1.0 / _SHRINK, fy=1.0 / _SHRINK, interpolation=cv2.INTER_AREA)
     small = small.astype(np.float32)
     unit = pitch / _SHRINK
-    period = max(int(round(unit)), 1)
-    length = max(int(round(max(0.35 * unit, 3.0))), 1)
+    period = max(round(unit), 1)
+    length = max(round(max(0.35 * unit, 3.0)), 1)
     light = cv2.blur(small, (period, length), borderType=cv2.BORDER_REFLECT_101)
-    size = int(round(2.6 * unit)) | 1
+    size = round(2.6 * unit) | 1
     opened = cv2.morphologyEx(light, cv2.MORPH_OPEN, np.ones((size, size), np.uint8), borderType=cv2.BORDER_REPLICATE)
     excess = light - cv2.blur(opened, (period, period))
     ambient = cv2.erode(small, np.ones((1, period | 1), np.uint8))
@@ -75,7 +75,7 @@ def find_spots(strip: Image, scale: Scale, search: Search | None = None, most: i
         if value < least:
             break
         found.append(_located(strip, pitch, (along + 0.5) * _SHRINK, (across + 0.5) * _SHRINK, value / line_light))
-        reach = int(round(unit)) + 1
+        reach = round(unit) + 1
         allowed[max(along - reach, 0) : along + reach + 1, max(across - reach, 0) : across + reach + 1] = 0
     return found
 
@@ -87,7 +87,7 @@ def _located(strip: Image, pitch: float, along: float, across: float, excess: fl
         window = strip[a0 : int(along + reach) + 1, c0 : int(across + reach) + 1].astype(np.float32)
         if window.size < 9:
             break
-        window = cv2.GaussianBlur(window, (0, 0), max(pitch / 12.0, 1.0))
+        window = np.asarray(cv2.GaussianBlur(window, (0, 0), max(pitch / 12.0, 1.0)), np.float32)
         # What a line leaves without its spot: the lowest along the line.
         window -= np.percentile(window, 25, axis=0)[None, :]
         weight = np.maximum(window - 0.3 * float(window.max()), 0.0) ** 2

@@ -179,7 +179,7 @@ def _background_noise(rise: Image, near: Image, width: float) -> float:
     across the lines, where nothing rises, cancel a slope of the ambient light.
     """
     lag = max(2, round(1.5 * width))
-    low = rise[:, :-2 * lag], rise[:, lag:-lag], rise[:, 2 * lag :]
+    low = rise[:, : -2 * lag], rise[:, lag:-lag], rise[:, 2 * lag :]
     dark = (low[0] <= 0.0) & (low[1] <= 0.0) & (low[2] <= 0.0)
     if int(dark.sum()) < 50:
         dark = low[1] <= 0.0
