@@ -127,9 +127,7 @@ class Reconstruct(Service):
             return found
         name = f"object {known.object_index}"
         if not known.calibration_hash:
-            raise _RefusedError(
-                ResultCode.NO_CALIBRATION, f"{name} has no calibration; make one with 'wearline calibrate'"
-            )
+            raise _RefusedError(ResultCode.NO_CALIBRATION, f"{name} has no calibration; run 'wearline calibrate'")
         try:
             recipe = parse_recipe(known.recipe_yaml, f"recipe of {name}")
         except RecipeError as error:

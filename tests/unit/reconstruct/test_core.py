@@ -26,11 +26,11 @@ PLATES = (0.0, 0.0, 3.0, 3.0, 6.0, 6.0)
 COMB = Comb()
 
 
-@pytest.mark.parametrize("width", [1.2, 1.8, 2.6, 4.0])
-@pytest.mark.parametrize("pitch", [21.0, 38.0, 59.0])
+@pytest.mark.parametrize(
+    ("width", "pitch"),
+    [(1.2, 21.0), (1.8, 21.0), (2.6, 21.0), (1.2, 38.0), (2.6, 38.0), (4.0, 38.0), (1.8, 59.0), (4.0, 59.0)],
+)
 def test_width_and_pitch_come_from_the_picture(width: float, pitch: float) -> None:
-    if pitch < 7.0 * width:
-        pytest.skip("stripes that touch have no background between them")
     lines = 2 * int(200 / pitch) + 1
     comb = Comb(pitch_px=pitch, width_px=width, lines=lines, bow_px=2.0)
     pixels, *_ = draw(comb, plate(0.0), 1)

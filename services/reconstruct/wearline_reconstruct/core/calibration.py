@@ -120,7 +120,7 @@ def calibrate(
     _check_shifts(heights, pictures, shots, settings)
     rows, sigma = _blocks(pictures)
     along_size = pictures[0].across_px.shape[1]
-    centre: F64 = np.arange(rows.shape[2]) * float(_BLOCK) + 0.5 * (_BLOCK - 1)
+    centre = np.asarray(np.arange(rows.shape[2]) * _BLOCK + 0.5 * (_BLOCK - 1), np.float64)
     u = _unit(centre, along_size)
     solution = _solve(heights, rows, sigma, u, settings.vibration_px, len(planes))
     _check_fit(heights, planes, solution, shots, settings)

@@ -28,7 +28,7 @@ NONE = -1
 _NEVER = 1e4
 _BY_HAND = 1e3
 _BY_SPOT = 150.0
-_COLUMN_STEP = 4
+_COLUMN_STEP = 6
 _MOST_FRAGMENTS = 400
 _MOST_PATCHES = 80
 
@@ -39,7 +39,7 @@ class NumberingSettings(Settings):
     gate_share: float = 0.48
     """In inspection, a point within this share of the pitch from the template's line is that line."""
     least_margin: float = 2.0
-    """Cost by which the best number must lead; 1 = a height difference of one pitch over four columns."""
+    """Cost by which the best number must lead; 1 = a height difference of one pitch over six columns."""
     least_patch_margin: float = 0.45
     """And per cross section of its rim, a patch of lines against the same patch one number off."""
 
@@ -160,7 +160,7 @@ def number_fragments(
     chosen = np.sort(np.argsort(-size, kind="stable")[:_MOST_FRAGMENTS])
     index_of = np.full(count, -1)
     index_of[chosen] = np.arange(len(chosen))
-    # Every fourth column says all; the first and last peak of a fragment stay, for what follows along the line.
+    # Every sixth column says all; the first and last peak of a fragment stay, for what follows along the line.
     peaks, ends = found.peaks, found.first
     sparse = peaks.along % _COLUMN_STEP == 0
     sparse[ends[:-1]] = True
@@ -186,7 +186,7 @@ def number_fragments(
     strength = np.add.reduceat(signal, starts) / total / max(float(np.median(signal)), 1e-6)
     unary[:, -1] = 1.5 * total * np.clip(strength, 0.1, 1.0) + 0.5
     _fix_by_spot(unary, candidates, along, across, node, pitch_px, spots, calibration.lines // 2)
-    height = _Heights(z, candidates.label, step_mm)
+    height = _Heights(np.nan_to_num(z, copy=False, nan=1e3), candidates.label, step_mm)
     follow = _neighbours_along(node, along, across, height, pitch_px, len(chosen))
     beside = _cross_sections(node, along, across, len(chosen))
     wall = -float(np.sign(a_usual))
@@ -229,7 +229,7 @@ class _Heights:
     """Heights of points under the candidate numbers of their fragments."""
 
     z_mm: F64
-    """[line number, point]. [mm]"""
+    """[line number, point], far away where the calibration knows nothing. [mm]"""
     label: I64
     """[node, slot]"""
     step_mm: float
@@ -238,7 +238,7 @@ class _Heights:
     def mean(self, owner: I64, point: I64, starts: I64) -> F64:
         """[group, slot]: means over runs of points that begin at ``starts``, of fragment ``owner`` each."""
         weight = np.diff(np.append(starts, len(point)))
-        summed = np.add.reduceat(np.nan_to_num(self.z_mm[:, point], nan=1e3), starts, axis=1) / weight
+        summed = np.add.reduceat(self.z_mm[:, point], starts, axis=1) / weight
         label = np.maximum(self.label[owner], 0)
         return np.asarray(summed[label, np.arange(len(owner))[:, None]])
 
@@ -339,12 +339,12 @@ def _neighbours_across(beside: list[_Beside], height: _Heights, rules: _Rules) -
             # Lines that a wall swallows are no surprise.
             lost = np.maximum(between - np.maximum(rules.wall * jump, 0.0), 0.0)
             gap = np.minimum(lost, 1.0) * rules.missing + np.maximum(lost - 1.0, 0.0) * rules.further
-            shown = np.minimum(pair.weight, 60)[:, None, None]
+            shown = np.minimum(pair.weight, 40)[:, None, None]
             cost = np.where(is_named, (rules.jump * np.abs(jump) + gap) * shown, 0.0)
         cost = np.where(is_behind, _NEVER, cost)
         # One column may be a crossing of noise; it must not forbid anything for ever.
         cost = np.minimum(cost, np.where(pair.weight >= 2, _NEVER, 4.0)[:, None, None])
-        weight = np.minimum(pair.weight, 60).astype(np.float64)
+        weight = np.minimum(pair.weight, 40).astype(np.float64)
         groups.append(_Pairs(pair.first, pair.second, cost, weight, jump, np.full(len(weight), pair.reach == 1)))
     return _joined(groups, slots)
 
@@ -382,7 +382,7 @@ def _neighbours_along(node: I64, along: I64, across: F64, height: _Heights, pitc
     # A line that goes on without a jump is the same one; after a jump this says little.
     strength = np.where(drift[source, target] < 0.05 * pitch_px, 3.0, 1.0) * (1.0 - gap[source, target] / reach)
     is_named = (label_a != NONE)[:, :, None] & (label_b != NONE)[:, None, :]
-    cost = np.where(is_named, strength[:, None, None] * np.minimum(np.nan_to_num(jump, nan=1.0), 1.0), 0.0)
+    cost = np.where(is_named, strength[:, None, None] * np.minimum(jump, 1.0), 0.0)
     n = len(source)
     return _Pairs(source, target, cost, np.ones(n), np.zeros_like(cost), np.zeros(n, bool))
 

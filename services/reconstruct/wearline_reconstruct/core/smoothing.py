@@ -102,7 +102,7 @@ def _lanes(
 
 
 def _filter(z: F64, variance: F64, process: F64, starts: Bool, *, gate: float, run_in: int) -> tuple[F64, F64]:
-    """(z, slope, p00, p01, p11), each (5, span, lane): filtered for the first half of the lanes, predicted for the rest."""
+    """z, slope, p00, p01, p11 as (5, span, lane): filtered for the first half of the lanes, predicted for the rest."""
     steps, lanes = z.shape
     half = lanes // 2
     filtered = np.empty((steps - run_in, 5, half))
