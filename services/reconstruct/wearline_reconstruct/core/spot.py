@@ -53,7 +53,7 @@ def find_spots(strip: Image, scale: Scale, search: Search | None = None, most: i
     opened = cv2.morphologyEx(light, cv2.MORPH_OPEN, np.ones((size, size), np.uint8), borderType=cv2.BORDER_REPLICATE)
     excess = light - cv2.blur(opened, (period, period))
     ambient = cv2.erode(small, np.ones((1, period | 1), np.uint8))
-    line_light = float(np.percentile((light - cv2.blur(ambient, (period, length)))[::3, ::4], 70))
+    line_light = max(float(np.percentile((light - cv2.blur(ambient, (period, length)))[::3, ::4], 70)), 1e-3)
     sparse = excess[::3, ::3]
     noise = float(np.median(np.abs(sparse - np.median(sparse)))) / 0.6745
     share = _LEAST_EXCESS if search is None else search.least_excess
