@@ -25,7 +25,7 @@ esac
 echo "installing Wearline into .venv (once; a minute or two) ..."
 .venv/bin/python -m pip install --disable-pip-version-check --progress-bar off -q --require-hashes -r "$pins" ||
     stop "the packages of $pins could not be installed (see above); this needs a package index once, then none"
-.venv/bin/python -m pip install --disable-pip-version-check -q --no-deps --no-build-isolation \
+.venv/bin/python -W ignore -m pip install --disable-pip-version-check -q --no-deps --no-build-isolation \
     -e . -e services/capture -e services/reconstruct -e services/judge -e services/fieldbus -e services/hmi
 [ "$kind" = run ] || touch .venv/ready-run
 touch ".venv/ready-$kind"

@@ -102,9 +102,7 @@ class ArraySpec:
 class Message(BaseModel):
     """Base of all messages."""
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", use_attribute_docstrings=True, arbitrary_types_allowed=True
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, arbitrary_types_allowed=True)
 
     array_field: ClassVar[str | None] = None
 
@@ -564,4 +562,3 @@ def decode(kind: type[M], header: bytes, payload: bytes) -> M:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         raise MessageError(f"{first['msg']}", f"{kind.__name__}.{place}", "both sides need one version") from error
-

@@ -47,7 +47,9 @@ def mutated(pixels: U8, rng: np.random.Generator) -> U8:
         elif kind == 10:
             image[r0:] = 0
         else:
-            turned = cv2.warpAffine(image, cv2.getRotationMatrix2D((320, 240), float(rng.uniform(0, 360)), 1.0), (cols, rows))
+            turned = cv2.warpAffine(
+                image, cv2.getRotationMatrix2D((320, 240), float(rng.uniform(0, 360)), 1.0), (cols, rows)
+            )
             image = np.asarray(turned, np.uint8)
     return image
 

@@ -70,8 +70,8 @@ class HmiService(Service):
             OUTCOME: self.on_outcome,
             PREVIEW: self.on_preview,
         }
-        table.update({topic: self.on_state for topic in STATES.values()})
-        table.update({topic: self.on_event for topic in EVENTS.values()})
+        table.update(dict.fromkeys(STATES.values(), self.on_state))
+        table.update(dict.fromkeys(EVENTS.values(), self.on_event))
         return table
 
     def on_verdict(self, verdict: Verdict) -> Iterable[Message]:

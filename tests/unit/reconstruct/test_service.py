@@ -93,7 +93,9 @@ def test_a_frame_becomes_line_points(calibration: bytes, frame: Frame) -> None:
     assert len(found.frame_hash) == 64
 
 
-def test_references_are_asked_for_once_and_the_recipe_every_cycle(calibration: bytes, frame: Frame, tmp_path: Path) -> None:
+def test_references_are_asked_for_once_and_the_recipe_every_cycle(
+    calibration: bytes, frame: Frame, tmp_path: Path
+) -> None:
     judge = Judge(calibration)
     made = service(judge, tmp_path)
     answer(made, frame)
@@ -253,10 +255,19 @@ def test_stripes_only_takes_any_picture(folder: Path, tmp_path: Path) -> None:
         (["calibrate", "--plane", "0=P0.png", "--lines", "11", "--out", "D.npz"], "two heights"),
         (["calibrate", "--plane", "zero=P0.png", "--out", "D.npz"], "HEIGHT=FILE"),
         (["calibrate", "--plane", "0=P0.png", "--plane", "3=cut.png", "--lines", "11", "--out", "D.npz"], "truncated"),
-        (["calibrate", "--plane", "0=P3.png", "--plane", "3=P0.png", "--plane", "6=P6.png", "--lines", "11", "--out", "D.npz"], "swapped"),
+        (
+            ["calibrate", "--plane", "0=P3.png", "--plane", "3=P0.png", "--plane", "6=P6.png", "--lines", "11", "--out", "D.npz"],
+            "swapped",
+        ),
         (["calibrate", "--plane", "0=P0.png", "--plane", "3=P3.png", "--lines", "25", "--out", "D.npz"], "--lines"),
-        (["calibrate", "--plane", "0=P0.png", "--plane", "3=P3.png", "--orientation", "vertical", "--out", "D.npz"], ""),
-        (["calibrate", "--plane", "0=P0.png", "--plane", "3=P3.png", "--lines", "11", "--target", "part.png", "--out", "D.npz"], "square"),
+        (
+            ["calibrate", "--plane", "0=P0.png", "--plane", "3=P3.png", "--orientation", "vertical", "--out", "D.npz"],
+            "",
+        ),
+        (
+            ["calibrate", "--plane", "0=P0.png", "--plane", "3=P3.png", "--lines", "11", "--target", "part.png", "--out", "D.npz"],
+            "square",
+        ),
     ],
 )  # fmt: skip
 def test_unusable_options_give_one_line_and_exit_2(

@@ -1,0 +1,1 @@
+"""Between the PLC and the cell: process image, handshake, journal."""
