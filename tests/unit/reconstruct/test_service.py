@@ -256,7 +256,8 @@ def test_stripes_only_takes_any_picture(folder: Path, tmp_path: Path) -> None:
         (["calibrate", "--plane", "zero=P0.png", "--out", "D.npz"], "HEIGHT=FILE"),
         (["calibrate", "--plane", "0=P0.png", "--plane", "3=cut.png", "--lines", "11", "--out", "D.npz"], "truncated"),
         (
-            ["calibrate", "--plane", "0=P3.png", "--plane", "3=P0.png", "--plane", "6=P6.png", "--lines", "11", "--out", "D.npz"],
+            ["calibrate", "--plane", "0=P3.png", "--plane", "3=P0.png", "--plane", "6=P6.png",
+                "--lines", "11", "--out", "D.npz"],
             "swapped",
         ),
         (["calibrate", "--plane", "0=P0.png", "--plane", "3=P3.png", "--lines", "25", "--out", "D.npz"], "--lines"),
@@ -265,7 +266,8 @@ def test_stripes_only_takes_any_picture(folder: Path, tmp_path: Path) -> None:
             "",
         ),
         (
-            ["calibrate", "--plane", "0=P0.png", "--plane", "3=P3.png", "--lines", "11", "--target", "part.png", "--out", "D.npz"],
+            ["calibrate", "--plane", "0=P0.png", "--plane", "3=P3.png",
+                "--lines", "11", "--target", "part.png", "--out", "D.npz"],
             "square",
         ),
     ],
