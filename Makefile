@@ -37,6 +37,9 @@ bench: .venv/ready-run ## Speed and precision against known truth
 kills: .venv/ready-dev ## 20 kill -9 while strokes run (long)
 	@.venv/bin/python -m pytest -m slow tests/faults $(T)
 
+mutations: .venv/ready-dev ## Break the product on purpose and see a test go red; T=word picks some (long)
+	@.venv/bin/python -m tests.mutations $(T)
+
 images: ## Container images of all services (needs Docker with BuildKit)
 	@deploy/images.sh
 
@@ -46,4 +49,4 @@ constraints: .venv/ready-dev ## Pin all third-party packages anew
 clean: ## Forget the environment and the demo's data
 	rm -rf .venv run build
 
-.PHONY: help demo test lint format bench kills images constraints clean
+.PHONY: help demo test lint format bench kills mutations images constraints clean

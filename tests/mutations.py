@@ -1,0 +1,117 @@
+"""Break the product on purpose, one promise at a time, and see a test go red: ``make mutations``.
+
+Each mutation replaces one piece of text in a copy of the tree and runs the tests that must object. A
+mutation whose text is no longer found is an error too: the list must follow the code.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from argparse import ArgumentParser
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+TIMEOUT_S = 300.0
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """One promise broken."""
+
+    promise: str
+    """What is broken, in words."""
+    path: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+    """Arguments of pytest."""
+
+
+RECONSTRUCT = "services/reconstruct/wearline_reconstruct"
+
+MUTATIONS: tuple[Mutation, ...] = (
+    Mutation(
+        "two laser lines swap their numbers",
+        f"{RECONSTRUCT}/core/chain.py",
+        "line, along = number[keep], found.peaks.along[keep].astype(np.int64)",
+        "line, along = np.array([*range(3), 4, 3, *range(5, 99)])[number[keep]], "
+        "found.peaks.along[keep].astype(np.int64)",
+        ("tests/metrology/test_heights.py", "tests/unit/reconstruct"),
+    ),
+    Mutation(
+        "a service publishes under another's name",
+        "wearline/bus.py",
+        "if topic.publisher == service}",
+        "if True}",
+        ("tests/contract",),
+    ),
+    Mutation(
+        "an unknown field of a message is accepted",
+        "wearline/messages.py",
+        'frozen=True, extra="forbid", use_attribute_docstrings=True, arbitrary_types_allowed=True',
+        'frozen=True, extra="ignore", use_attribute_docstrings=True, arbitrary_types_allowed=True',
+        ("tests/contract",),
+    ),
+    Mutation(
+        "an array of another dtype is accepted",
+        "wearline/messages.py",
+        "if value.dtype != np.dtype(self.dtype):",
+        "if False:",
+        ("tests/contract",),
+    ),
+)
+
+
+def is_noticed(mutation: Mutation) -> tuple[bool, str]:
+    """Whether a test objects, and the first one that does."""
+    with tempfile.TemporaryDirectory() as folder:
+        tree = Path(folder)
+        listed = subprocess.run(
+            ["git", "ls-files", "-z", "wearline", "services", "tests", "deploy", "pyproject.toml"],
+            cwd=ROOT, capture_output=True, check=True,
+        ).stdout  # fmt: skip
+        for name in listed.decode().split("\0"):
+            source = ROOT / name
+            if name and source.is_file():
+                target = tree / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(source.read_bytes())
+        broken = tree / mutation.path
+        text = broken.read_text(encoding="utf-8")
+        if text.count(mutation.old) != 1:
+            raise SystemExit(f"{mutation.path}: found {text.count(mutation.old)} times: {mutation.old!r}")
+        broken.write_text(text.replace(mutation.old, mutation.new), encoding="utf-8")
+        # Before what is installed, so that the broken copy is what runs; also in processes that a test starts.
+        roots = [tree, *sorted((tree / "services").iterdir())]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, roots))}
+        run = subprocess.run(
+            [sys.executable, "-m", "pytest", "-x", *mutation.tests],
+            cwd=tree, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S,
+        )  # fmt: skip
+        first = next((line for line in run.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))), "")
+        # 1: a test failed; anything else (no test found, a broken import) would prove nothing.
+        return run.returncode == 1 and first.startswith("FAILED"), first.split(" - ")[0].removeprefix("FAILED ")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Try every mutation whose promise contains the given word; 1 when one survives."""
+    parser = ArgumentParser(description=__doc__)
+    parser.add_argument("word", nargs="?", default="")
+    wanted = parser.parse_args(argv).word
+    survivors = 0
+    chosen = [mutation for mutation in MUTATIONS if wanted in mutation.promise]
+    for mutation in chosen:
+        noticed, first = is_noticed(mutation)
+        survivors += not noticed
+        print(f"{'red' if noticed else 'SURVIVES':<8}  {mutation.promise}\n          {first}", flush=True)
+    print(f"{len(chosen) - survivors} of {len(chosen)} mutations turned a test red")
+    return 1 if survivors or not chosen else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
