@@ -2,12 +2,16 @@
 
 ``python deploy/dependencies.py [--dev] [--extra NAME] DISTRIBUTION...`` reads the pyproject.toml
 files, so that the Makefile and the Dockerfile install exactly what each distribution declares.
-``pip install -c constraints.txt`` then pins and checks the hash of every one of them.
+``--locked REPORT`` prints the blocks of constraints.txt, hashes included, for the packages of a pip
+resolution (``pip install --dry-run --report REPORT``): ``pip install --require-hashes`` then takes those alone.
+``--locked-extra NAME`` does the same for the packages of one extra.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import re
 import sys
 import tomllib
 from pathlib import Path
@@ -35,12 +39,40 @@ def requirements(services: list[str], extras: list[str], with_dev: bool) -> list
     return sorted(name for name in found if not name.startswith("wearline"))
 
 
+def plain(name: str) -> str:
+    """The name under which the index knows a package."""
+    return re.sub(r"[-_.]+", "-", re.split(r"[ \[<>=!~;(]", name, maxsplit=1)[0]).lower()
+
+
+def locked(wanted: set[str]) -> list[str]:
+    """The blocks of constraints.txt for some packages, in its order.
+
+    Raises:
+        SystemExit: one of them is not pinned there.
+    """
+    text = (ROOT / "constraints.txt").read_text(encoding="utf-8")
+    blocks = {plain(block): block for block in re.split(r"\n(?=\S)", text.strip()) if "==" in block}
+    if missing := sorted(wanted - blocks.keys()):
+        sys.exit(f"constraints.txt: does not pin {', '.join(missing)}; pin anew with 'make constraints'")
+    return [block for name, block in blocks.items() if name in wanted]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("services", nargs="*")
     parser.add_argument("--extra", action="append", default=[])
     parser.add_argument("--dev", action="store_true")
+    parser.add_argument("--locked", type=Path, metavar="REPORT")
+    parser.add_argument("--locked-extra", metavar="NAME")
     arguments = parser.parse_args()
+    if arguments.locked is not None:
+        resolved = json.loads(arguments.locked.read_text(encoding="utf-8"))["install"]
+        sys.stdout.write("\n".join(locked({plain(entry["metadata"]["name"]) for entry in resolved})) + "\n")
+        return
+    if arguments.locked_extra is not None:
+        extra = declared(ROOT)["project"]["optional-dependencies"][arguments.locked_extra]
+        sys.stdout.write("\n".join(locked({plain(name) for name in extra})) + "\n")
+        return
     sys.stdout.write("\n".join(requirements(arguments.services, arguments.extra, arguments.dev)) + "\n")
 
 
