@@ -7,9 +7,12 @@ or a cycle id.
 from __future__ import annotations
 
 import json
+import math
+import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any, TypeVar
 
 import prometheus_client
@@ -86,7 +89,22 @@ DROPPED = counter(
 TOPIC_AGE = gauge(
     "wearline_topic_age_seconds", "Since the last message of a topic arrived", ("cell", "service", "topic")
 )
+DISK_FREE = gauge("wearline_disk_free_bytes", "Room left where the cell's data lie", ("cell", "service"))
+DISK_SIZE = gauge("wearline_disk_size_bytes", "Size of the disk where the cell's data lie", ("cell", "service"))
 SERVICE_UP = gauge("wearline_service_up", "1 while a service is there and not degraded", ("cell", "service"))
+
+
+def watch_disk(cell: str, service: str, folder: Path) -> None:
+    """Tell room and size of the disk of a folder with every scrape; NaN while it cannot be asked."""
+
+    def usage(which: int) -> float:
+        try:
+            return float(shutil.disk_usage(folder)[which])
+        except OSError:
+            return math.nan
+
+    DISK_FREE.labels(cell, service).set_function(lambda: usage(2))
+    DISK_SIZE.labels(cell, service).set_function(lambda: usage(0))
 
 
 class MetricsServer:

@@ -334,6 +334,7 @@ class _Life:
         server = None
         bus = Bus(self._cell.cell, self._name, self._cell.router.endpoint)
         runner = Runner(service, bus)
+        metrics.watch_disk(self._cell.cell, self._name, self._cell.data_dir / self._name)
         try:
             try:
                 server = metrics.serve(

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 import urllib.error
 import urllib.request
 from collections.abc import Mapping
+from pathlib import Path
 
 import pytest
+from prometheus_client import generate_latest
 
 from wearline import metrics
 from wearline.errors import ConfigError
@@ -52,3 +55,17 @@ def test_it_serves_metrics_and_health() -> None:
         server.close()
     again = metrics.serve("127.0.0.1", server.port, lambda: state[0])
     again.close()
+
+
+def test_room_on_disk_is_told(tmp_path: Path) -> None:
+    metrics.watch_disk("c9", "judge", tmp_path)
+    metrics.watch_disk("c9", "hmi", tmp_path / "absent")
+    text = generate_latest(metrics.REGISTRY).decode()
+    free, size = (
+        float(
+            next(line for line in text.splitlines() if line.startswith(name + '{cell="c9",service="judge"}')).split()[1]
+        )
+        for name in ("wearline_disk_free_bytes", "wearline_disk_size_bytes")
+    )
+    assert 0 < free < size == shutil.disk_usage(tmp_path).total
+    assert 'wearline_disk_free_bytes{cell="c9",service="hmi"} NaN' in text
