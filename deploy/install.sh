@@ -5,7 +5,7 @@ set -eu
 step=$1 service=$2
 all="capture reconstruct judge fieldbus hmi"
 case $service in
-    capture | reconstruct | judge | fieldbus | hmi) parts=$service extras= ;;
+    capture | fieldbus | hmi | judge | reconstruct) parts=$service extras= ;;
     router) parts= extras= ;;
     plc-sim) parts=fieldbus extras= ;;
     tools) parts=$all extras="--extra demo" ;;
