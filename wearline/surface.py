@@ -50,11 +50,11 @@ def dense_map(
     rows, cols = shape
     x, y, width, height = roi or (0, 0, cols, rows)
     along_size, across_size = (rows, cols) if is_vertical else (cols, rows)
-    z = np.full((along_size, across_size), np.nan, np.float32)
-    sigma = np.full((along_size, across_size), np.nan, np.float32)
+    z = np.full((across_size, along_size), np.nan, np.float32)
+    sigma = np.full((across_size, along_size), np.nan, np.float32)
     if len(points):
         _fill(points, is_vertical, z, sigma)
-    if not is_vertical:
+    if is_vertical:
         z, sigma = z.T, sigma.T
     window = (slice(y, y + height), slice(x, x + width))
     return SurfaceMap(
@@ -63,10 +63,11 @@ def dense_map(
 
 
 def _fill(points: F32, is_vertical: bool, z_map: F32, sigma_map: F32) -> None:
-    along_size = z_map.shape[0]
+    """Draw into maps [across, along]."""
+    along_size = z_map.shape[1]
     line = np.rint(points[:, 0]).astype(np.int64)
     along = np.rint(points[:, 1 if is_vertical else 2]).astype(np.int64)
-    inside = (along >= 0) & (along < along_size) & np.isfinite(points).all(axis=1) & (line >= 0)
+    inside = (along >= 0) & (along < along_size) & np.isfinite(points.sum(axis=1)) & (line >= 0)
     line, along = line[inside], along[inside]
     grid = np.full((3, int(line.max(initial=-1)) + 1, along_size), np.nan, np.float32)
     for k, column in enumerate((2 if is_vertical else 1, 3, 4)):
@@ -79,10 +80,60 @@ def _fill(points: F32, is_vertical: bool, z_map: F32, sigma_map: F32) -> None:
     joined = is_open & ~_steps(gap, rise, sigma)
     slope[~joined] = np.nan
     tangent = _tangents(gap, slope)
-    for k in range(len(gap)):
-        columns = np.flatnonzero(joined[k])
-        if len(columns):
-            _fill_interval(k, columns, across, z, sigma, gap, slope, tangent, z_map, sigma_map)
+    # Hermite's cubic over t = 0 .. 1: z0 + chord t + u (bend - twist t), u = t (1 - t).
+    chord = slope * gap
+    bend = tangent[:-1] * gap - chord
+    bend_after = tangent[1:] * gap - chord
+    # What a cubic may miss is a share of what it adds to the chord.
+    bulge = np.float32(0.6) * (np.abs(bend) + np.abs(bend_after))
+    intervals = np.stack([
+        np.where(joined, across[:-1], np.nan), 1.0 / gap, z[:-1], chord, bend, bend + bend_after,
+        sigma[:-1] ** 2, sigma[1:] ** 2 - sigma[:-1] ** 2, bulge * bulge,
+    ])  # fmt: skip
+    edges = np.arange(0, along_size, _CHUNK)
+    first = np.ceil(np.fmin.reduceat(intervals[0], edges, axis=1))
+    last = np.floor(np.fmax.reduceat(np.where(joined, across[1:], np.nan), edges, axis=1))
+    buffers = np.empty((4, 0), np.float32)
+    for chunk, edge in enumerate(edges):
+        columns = slice(edge, edge + _CHUNK)
+        for k in np.flatnonzero(np.isfinite(first[:, chunk])):
+            rows = slice(max(int(first[k, chunk]), 0), min(int(last[k, chunk]) + 1, len(z_map)))
+            size = (rows.stop - rows.start) * _CHUNK
+            if buffers.shape[1] < size:
+                buffers = np.empty((4, 2 * size), np.float32)
+            if size > 0:
+                _fill_interval(intervals[:, k, columns], rows, buffers, z_map[rows, columns], sigma_map[rows, columns])
+
+
+_CHUNK = 512
+"""Columns that are drawn at once: what one step touches stays in the cache. [px]"""
+
+
+def _fill_interval(mine: F32, rows: slice, buffers: F32, z_part: F32, sigma_part: F32) -> None:
+    """Pixels between two lines; ``mine`` is what `_fill` stacks: [9, along]."""
+    top, per_px, start, chord, bend, twist, variance, more, bulge2 = mine
+    t, u, value, spread = (buffer[: z_part.size].reshape(z_part.shape) for buffer in buffers)
+    np.subtract(np.arange(rows.start, rows.stop, dtype=np.float32)[:, None], top, out=t)
+    t *= per_px
+    np.multiply(t, t, out=u)
+    np.subtract(t, u, out=u)
+    # u is negative outside and NaN where nothing is drawn.
+    inside = u >= 0.0
+    np.multiply(t, twist, out=value)
+    np.subtract(bend, value, out=value)
+    value *= u
+    np.multiply(t, chord, out=spread)
+    value += spread
+    value += start
+    np.copyto(z_part, value, where=inside)
+    u *= u
+    u *= bulge2
+    t *= more
+    u += t
+    u += variance
+    with np.errstate(invalid="ignore"):
+        np.sqrt(u, out=u)
+    np.copyto(sigma_part, u, where=inside)
 
 
 def _steps(gap: F32, rise: F32, sigma: F32) -> NDArray[np.bool_]:
@@ -117,29 +168,3 @@ def _tangents(gap: F32, slope: F32) -> F32:
     chord = np.where(np.isfinite(after), after, before)
     tangent = np.where(np.isfinite(both), both, np.where(np.isfinite(rim), rim, chord))
     return tangent.astype(np.float32)
-
-
-def _fill_interval(
-    k: int, columns: NDArray[np.int64], across: F32, z: F32, sigma: F32, gap: F32, slope: F32, tangent: F32,
-    z_map: F32, sigma_map: F32,
-) -> None:  # fmt: skip
-    """Pixels from line k up to, and without, line k + 1 (with it where the surface ends there)."""
-    top, below = across[k, columns], across[k + 1, columns]
-    first = np.ceil(top).astype(np.int64)
-    reach = int(np.ceil(below - first).max()) + 1
-    width = gap[k, columns]
-    t = (np.arange(reach, dtype=np.float32)[None, :] + (first - top).astype(np.float32)[:, None]) / width[:, None]
-    is_inside = (t <= 1.0) & (first[:, None] + np.arange(reach) < z_map.shape[1]) & (first >= 0)[:, None]
-    m0, m1 = tangent[k, columns] * width, tangent[k + 1, columns] * width
-    chord = slope[k, columns] * width
-    c2, c3 = 3.0 * chord - 2.0 * m0 - m1, m0 + m1 - 2.0 * chord
-    value = ((c3[:, None] * t + c2[:, None]) * t + m0[:, None]) * t + z[k, columns][:, None]
-    v0, v1 = sigma[k, columns] ** 2, sigma[k + 1, columns] ** 2
-    # What a cubic may miss is a share of what it adds to the chord.
-    bulge = 0.15 * (np.abs(m0 - chord) + np.abs(m1 - chord))
-    u = t * (1.0 - t)
-    variance = v0[:, None] + (v1 - v0)[:, None] * t + (np.float32(4.0) * bulge[:, None] * u) ** 2
-    target = (columns * z_map.shape[1] + first)[:, None] + np.arange(reach)
-    chosen = target[is_inside]
-    z_map.reshape(-1)[chosen] = value[is_inside]
-    sigma_map.reshape(-1)[chosen] = np.sqrt(variance[is_inside])

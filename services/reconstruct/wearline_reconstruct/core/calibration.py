@@ -222,7 +222,7 @@ def _solve(heights: F64, rows: F64, sigma: F64, u: F64, vibration_px: float, pla
     residual = np.zeros_like(rows)
     alike = _likeness(lines, is_used, slope)
     size = lines * terms + shared
-    inverse = np.eye(size)
+    normal = np.eye(size)
     for turn in range(8):
         normal, right = np.zeros((size, size)), np.zeros(size)
         own = lines * terms
@@ -276,7 +276,9 @@ def _solve(heights: F64, rows: F64, sigma: F64, u: F64, vibration_px: float, pla
             far = np.maximum(np.nan_to_num(ratio), 1e-9) / (3.0 * scale)
             weight = base * np.minimum(1.0, 1.0 / far) ** 2
             likeness = _likeness_along(residual)
-    covariance = [inverse[k * terms : (k + 1) * terms, k * terms : (k + 1) * terms] for k in range(lines)]
+    # Of the lines for themselves: what offsets and b leave open is common to all, and counted as such.
+    alone = np.linalg.pinv(normal[: lines * terms, : lines * terms], rcond=1e-14, hermitian=True)
+    covariance = [alone[k * terms : (k + 1) * terms, k * terms : (k + 1) * terms] for k in range(lines)]
     g[~is_used] = 0.0
     return _Solution(x1, g, b, offset, residual, weight, covariance, scale)
 
