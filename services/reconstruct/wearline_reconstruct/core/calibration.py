@@ -277,8 +277,8 @@ def _solve(heights: F64, rows: F64, sigma: F64, u: F64, vibration_px: float, pla
             weight = base * np.minimum(1.0, 1.0 / far) ** 2
             likeness = _likeness_along(residual)
     # Of the lines for themselves: what offsets and b leave open is common to all, and counted as such.
-    alone = np.linalg.pinv(normal[: lines * terms, : lines * terms], rcond=1e-14, hermitian=True)
-    covariance = [alone[k * terms : (k + 1) * terms, k * terms : (k + 1) * terms] for k in range(lines)]
+    alone: F64 = np.linalg.pinv(normal[: lines * terms, : lines * terms], rcond=1e-14, hermitian=True)
+    covariance: list[F64] = [alone[k * terms : (k + 1) * terms, k * terms : (k + 1) * terms] for k in range(lines)]
     g[~is_used] = 0.0
     return _Solution(x1, g, b, offset, residual, weight, covariance, scale)
 
@@ -376,6 +376,7 @@ def _assemble(
     widths = [p.scale.width_px for p in pictures]
     a_usual = float(np.nanmedian(a))
     noise = _noise(shots, pictures, is_vertical)
+    texture, streak = _texture(solution, pictures)
     residual = [
         {
             "where": shot.where,
@@ -394,7 +395,8 @@ def _assemble(
         "pitch_px": round(float(np.median([p.scale.pitch_px for p in pictures])), 3),
         "signal_dn": round(float(np.median([p.signal_dn for p in pictures])), 2),
         "noise_dn": round(float(np.median([p.noise_dn for p in pictures])), 3),
-        "texture_px": round(_texture(solution, pictures), 4),
+        "texture_px": round(texture, 4),
+        "streak_px": round(streak, 1),
         "mm_per_line_px": round(a_usual, 6),
     }
     draft = Calibration(
@@ -475,14 +477,30 @@ def _uncertainty(
     return common, own
 
 
-def _texture(solution: _Solution, pictures: Sequence[PlaneLines]) -> float:
-    """What stays in a point's position after the fast noise: streaks of the surface. [px]"""
-    slow = solution.residual[:, :, : solution.residual.shape[2] // 4 * 4]
-    shots, lines, blocks = slow.shape
-    mean = slow.reshape(shots, lines, blocks // 4, 4).mean(axis=3)
-    spread = float(np.nanmedian(np.abs(mean))) / 0.6745
-    fast = float(np.median([np.nanmedian(p.sigma_px) * np.sqrt(p.correlation_px / (4 * _BLOCK)) for p in pictures]))
-    return float(np.sqrt(max(spread**2 - fast**2, 0.0)))
+_USUAL_STREAK_PX = 60.0
+"""Length of streaks of rolled sheet, where the plates do not show any. [px]"""
+
+
+def _texture(solution: _Solution, pictures: Sequence[PlaneLines]) -> tuple[float, float]:
+    """What stays in a point's position after the fast noise, streaks of the surface, and how long they are. [px]"""
+    short, long = 4, 16
+    own = float(np.median([np.nanmedian(p.sigma_px) ** 2 * p.correlation_px for p in pictures]))
+
+    def variance(blocks: int) -> float:
+        slow = solution.residual[:, :, : solution.residual.shape[2] // blocks * blocks]
+        mean = slow.reshape(*slow.shape[:2], -1, blocks).mean(axis=3)
+        if not np.isfinite(mean).any():
+            return 0.0
+        return max((float(np.nanmedian(np.abs(mean))) / 0.6745) ** 2 - own / (blocks * _BLOCK), 0.0)
+
+    near, far = variance(short), variance(long)
+    if near < 0.1 * own / (short * _BLOCK):
+        return float(np.sqrt(near)), _USUAL_STREAK_PX
+    # Means over W of what is alike over S have the share S / (S + W) of its variance.
+    ratio = min(far / near, 0.8)
+    streak = (long * ratio - short) * _BLOCK / (1.0 - ratio)
+    # The smoother's reach is not long against a streak, so that less than all of it counts.
+    return float(np.sqrt(near)), float(np.clip(0.75 * streak, 0.4 * _USUAL_STREAK_PX, 2.0 * _USUAL_STREAK_PX))
 
 
 def _noise(shots: Sequence[Shot], pictures: Sequence[PlaneLines], is_vertical: bool) -> F64:

@@ -357,12 +357,17 @@ def _measured(found: Fragments, number: I64, spot_found: bool, prepared: Prepare
     label = np.full((lines, along_size), -1, np.int64)
     grid_z[line, along] = z
     length = max(found.correlation_px, 1.0)
-    long_run = np.sqrt(fast**2 * length + texture**2 * _STREAK_PX)
+    streak = float(calibration.meta.get("streak_px", _STREAK_PX))
+    long_run = np.sqrt(fast**2 * length + texture**2 * streak)
     grid_sigma[line, along] = slope * long_run
     label[line, along] = found.label[keep]
     starts = _piece_starts(label, grid_z)
     point = slope * np.sqrt(fast**2 + texture**2)
-    process = _process_noise(grid_z, float(np.median(point[::9])), grid_sigma)
+    steep = float(np.median(slope[::9])) ** 2
+    process = _process_noise(
+        grid_z, steep * float(np.median(fast[::9])) ** 2, length, steep * float(np.median(texture[::9])) ** 2,
+        streak, prepared.settings.smoothing.reach_px,
+    )  # fmt: skip
     smoothed = smooth(grid_z, grid_sigma, starts, 1.0, process, prepared.settings.smoothing)
     z_raw, z = z, smoothed.z_mm[line, along]
     missed = _misfit(grid_z - smoothed.z_mm, float(np.median((slope * fast)[::9])), length)[line, along]
@@ -430,31 +435,54 @@ def _piece_starts(label: I64, z: F64) -> Bool:
     return starts
 
 
-_LAGS = (16, 32)
-_LONGEST_PX = 40.0
+_LAGS = (8, 16, 32, 64, 128)
+_SURE = 3.0
+"""A bend that stands out by this many standard deviations is followed."""
 
 
-def _process_noise(z: F64, point_mm: float, sigma: F64) -> F64:
+def _process_noise(z: F64, fast_mm2: float, fast_px: float, slow_mm2: float, slow_px: float, reach_px: float) -> F64:
     """Variance that the slope gains per pixel, (line, along), from the surface's own third differences. [mm^2/px^3]
 
-    Third differences of a surface whose slope is a random walk have the variance q lag^3.
+    Differences of means over one lag, so that a bend is found at the scale at which it stands out
+    best, on a line for itself or on three neighbours together. A surface whose slope is a random
+    walk shows third differences of the variance q lag^3.
+
+    Args:
+        z: heights (line, along), NaN = no point. [mm]
+        fast_mm2: variance of one point by noise that is alike over ``fast_px``.
+        slow_mm2: and by streaks that are alike over ``slow_px``.
+        reach_px: length over which a surface that shows no bends is averaged.
     """
-    usual = float(np.nanmedian(sigma[:, ::9])) if np.isfinite(sigma[:, ::9]).any() else 0.0
-    process = np.full(z.shape, usual**2 / _LONGEST_PX**4)
+    have = np.isfinite(z).astype(np.float32)
+    filled = np.where(have > 0, z, 0.0).astype(np.float32)
+    long_run = fast_mm2 * fast_px + slow_mm2 * slow_px
+    process = np.full(z.shape, long_run / reach_px**4, np.float32)
+    size = z.shape[1]
     for lag in _LAGS:
-        if z.shape[1] <= 4 * lag:
+        if size <= 4 * lag:
             continue
-        third = z[:, 3 * lag :] - 3.0 * z[:, 2 * lag : -lag] + 3.0 * z[:, lag : -2 * lag] - z[:, : -3 * lag]
-        have = np.isfinite(third)
-        squared = np.where(have, third * third, 0.0).astype(np.float32)
-        mean = cv2.blur(squared, (17, 1)) / np.maximum(cv2.blur(have.astype(np.float32), (17, 1)), 0.05)
-        excess = np.maximum(mean - np.float32(2.5 * 20.0 * point_mm**2), 0.0) / lag**3
+        count = cv2.blur(have, (lag, 1), borderType=cv2.BORDER_CONSTANT)
+        mean = cv2.blur(filled, (lag, 1), borderType=cv2.BORDER_CONSTANT)
+        mean = np.where(count > 0.6, mean / np.maximum(count, 0.6), np.float32(np.nan))
+        third = mean[:, 3 * lag :] - mean[:, : -3 * lag] + 3.0 * (mean[:, lag : -2 * lag] - mean[:, 2 * lag : -lag])
+        limit = _SURE**2 * 20.0 * (fast_mm2 * min(fast_px / lag, 1.0) + slow_mm2 * min(slow_px / lag, 1.0))
+        third[np.isnan(third)] = 0.0
+        three = cv2.blur(third, (1, 3), borderType=cv2.BORDER_REPLICATE)
+        np.multiply(third, third, out=third)
+        np.multiply(three, three, out=three)
+        third[third < limit] = 0.0
+        three[three < limit / 3.0] = 0.0
+        bend = np.maximum(third, three)
+        if not bend.any():
+            continue
         # A bend lies anywhere within the reach of the difference that shows it.
-        widened = cv2.dilate(excess, np.ones((1, 2 * lag + 1), np.uint8))
+        widened = cv2.dilate(bend * np.float32(min(8.0 / lag, 1.0) / lag**3), np.ones((1, 2 * lag + 1), np.uint8))
         start = 3 * lag // 2
-        padded = np.pad(widened, ((0, 0), (start, z.shape[1] - widened.shape[1] - start)), mode="edge")
-        np.maximum(process, padded, out=process)
-    return process
+        process[:, start : start + widened.shape[1]] = np.maximum(process[:, start : start + widened.shape[1]], widened)
+        np.maximum(process[:, :start], widened[:, :1], out=process[:, :start])
+        tail = start + widened.shape[1]
+        np.maximum(process[:, tail:], widened[:, -1:], out=process[:, tail:])
+    return process.astype(np.float64)
 
 
 def _misfit(residual: F64, fast_mm: float, length: float) -> F64:

@@ -30,7 +30,9 @@ class SmoothingSettings(Settings):
 
     gate_sigma: float = 6.0
     """A point further off the prediction than this many standard deviations counts less and less."""
-    overlap_px: int = 64
+    reach_px: float = 60.0
+    """Scale over which a surface that shows no bends is smoothed: about three times as many points count. [px]"""
+    overlap_px: int = 128
     """Run-in of each piece; longer than the memory of the filter. [px]"""
 
 
