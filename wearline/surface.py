@@ -94,9 +94,9 @@ def _fill(points: F32, is_vertical: bool, z_map: F32, sigma_map: F32) -> None:
     first = np.ceil(np.fmin.reduceat(intervals[0], edges, axis=1))
     last = np.floor(np.fmax.reduceat(np.where(joined, across[1:], np.nan), edges, axis=1))
     buffers = np.empty((4, 0), np.float32)
-    for chunk, edge in enumerate(edges):
+    for chunk, edge in enumerate(edges.tolist()):
         columns = slice(edge, edge + _CHUNK)
-        for k in np.flatnonzero(np.isfinite(first[:, chunk])):
+        for k in np.flatnonzero(np.isfinite(first[:, chunk])).tolist():
             rows = slice(max(int(first[k, chunk]), 0), min(int(last[k, chunk]) + 1, len(z_map)))
             size = (rows.stop - rows.start) * _CHUNK
             if buffers.shape[1] < size:

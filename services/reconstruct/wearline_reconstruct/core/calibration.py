@@ -277,8 +277,10 @@ def _solve(heights: F64, rows: F64, sigma: F64, u: F64, vibration_px: float, pla
             weight = base * np.minimum(1.0, 1.0 / far) ** 2
             likeness = _likeness_along(residual)
     # Of the lines for themselves: what offsets and b leave open is common to all, and counted as such.
-    alone: F64 = np.linalg.pinv(normal[: lines * terms, : lines * terms], rcond=1e-14, hermitian=True)
-    covariance: list[F64] = [alone[k * terms : (k + 1) * terms, k * terms : (k + 1) * terms] for k in range(lines)]
+    alone = np.asarray(
+        np.linalg.pinv(normal[: lines * terms, : lines * terms], rcond=1e-14, hermitian=True), np.float64
+    )
+    covariance = [alone[k * terms : (k + 1) * terms, k * terms : (k + 1) * terms] for k in range(lines)]
     g[~is_used] = 0.0
     return _Solution(x1, g, b, offset, residual, weight, covariance, scale)
 
