@@ -1,7 +1,7 @@
 """The web interface as a service of the cell: messages in, snapshots for the web server out.
 
 The runner's thread handles messages; the web server's thread reads `snapshot`, one immutable
-object that is replaced as a whole. Nothing flows back: a browser cannot reach a cycle.
+object that is replaced as a whole, and asks other services on threads of its own.
 """
 
 from __future__ import annotations
@@ -14,13 +14,15 @@ from wearline.config import CellSettings
 from wearline.errors import BusError
 from wearline.messages import AskRecords, Event, Message, Outcome, Preview, Records, ServiceState, Verdict, View
 from wearline.service import Asker, Health, Service
-from wearline.topics import EVENTS, OUTCOME, PREVIEW, RECORDS, STATES, VERDICT, VIEW, Topic
+from wearline.topics import EVENTS, OUTCOME, PREVIEW, RECORDS, STATES, VERDICT, VIEW, Query, Topic
 from wearline_hmi.config import HmiSettings
 from wearline_hmi.core import state as cell_state
 from wearline_hmi.core.state import CellState
 
 RECORDS_ASKED = 100
 RECORDS_TIMEOUT_S = 0.5
+HISTORY_S = 2.0
+"""What arrives so soon after the start may be history that the bus kept for late joiners. [s]"""
 
 
 class Web(Protocol):
@@ -56,11 +58,13 @@ class HmiService(Service):
         self._asker: Asker | None = None
         self._ask_at_s = 0.0
         self._asks_failed = 0
+        self._joined_s = clock()
 
     def start(self, asker: Asker) -> Iterable[Message]:
         self._asker = asker
         if self._open_web is not None:
             self._web = self._open_web(self)
+        self._joined_s = self.clock()
         return ()
 
     def handlers(self) -> Mapping[Topic, Callable[[Any], Iterable[Message]]]:
@@ -75,8 +79,20 @@ class HmiService(Service):
         return table
 
     def on_verdict(self, verdict: Verdict) -> Iterable[Message]:
-        self.snapshot = cell_state.with_verdict(self.snapshot, verdict, self.clock())
+        now_s = self.clock()
+        at_s = now_s if now_s - self._joined_s > HISTORY_S else None
+        self.snapshot = cell_state.with_verdict(self.snapshot, verdict, at_s)
         return ()
+
+    def ask(self, query: Query, question: Message, argument: str = "", timeout_s: float = 2.0) -> Message:
+        """Ask another service, from any thread.
+
+        Raises:
+            BusError: nobody answered in time, or the answerer refused (its sentence is the text).
+        """
+        if self._asker is None:
+            raise BusError("is not open yet", "bus of hmi", "try again in a moment")
+        return self._asker.ask(query, question, argument, timeout_s)
 
     def on_view(self, view: View) -> Iterable[Message]:
         self.snapshot = cell_state.with_view(self.snapshot, view, self.clock())

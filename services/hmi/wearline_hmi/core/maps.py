@@ -43,7 +43,7 @@ class ViewHeader:
 def nice_above(value: float) -> float:
     """The next of 1, 2, 5 times a power of ten that is not below `value` (> 0)."""
     decade = 10.0 ** math.floor(math.log10(value))
-    return next(decade * m for m in (1.0, 2.0, 5.0, 10.0) if decade * m >= value * (1 - 1e-9))
+    return next(decade * m for m in (1.0, 2.0, 5.0, 10.0) if decade * m >= value * (1 - 1e-6))
 
 
 def _span(values: NDArray[np.float32], low: float, high: float) -> tuple[float, float]:
@@ -70,7 +70,8 @@ def scale_of(name: str, values_mm: NDArray[np.float32], width: float) -> MapScal
             middle = 0.5 * (low + high)
             low, high = middle - 0.05, middle + 0.05
         kind = "height"
-    wanted = 0.18 * width / (high - low)
+    # What is left of a difference is mostly noise: a lower relief keeps it from looking like rock.
+    wanted = (0.06 if kind == "signed" else 0.18) * width / (high - low)
     relief = nice_above(wanted) if wanted > 1.0 else 1.0
     return MapScale(low, high, kind, min(relief, 1000.0))
 

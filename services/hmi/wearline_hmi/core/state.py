@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from wearline.messages import Event, Outcome, Preview, Records, ServiceState, Verdict, View, WearTrend
 from wearline.topics import SERVICES
 
@@ -54,10 +56,15 @@ class CellState:
     cell: str
     verdict: Verdict | None = None
     verdict_at_s: float | None = None
+    """None also for a verdict that was given before this service joined the bus."""
     view: View | None = None
     view_at_s: float | None = None
+    view_before: View | None = None
+    """A browser may still be fetching it."""
     preview: Preview | None = None
     preview_at_s: float | None = None
+    """When this picture came first: a camera that takes no new one says the last one again."""
+    preview_heard_s: float | None = None
     preview_serial: int = 0
     outcome: Outcome | None = None
     strokes: tuple[Stroke, ...] = ()
@@ -73,12 +80,13 @@ class CellState:
     records_at_s: float | None = None
 
 
-def with_verdict(state: CellState, verdict: Verdict, now_s: float) -> CellState:
-    """The snapshot after judge's verdict; one that was already shown changes nothing."""
-    if any(row.cycle_id == verdict.cycle_id for row in state.strokes[:20]):
-        if state.verdict is None or state.verdict.cycle_id != verdict.cycle_id:
-            return state if state.verdict is not None else replace(state, verdict=verdict, verdict_at_s=now_s)
-        return state
+def with_verdict(state: CellState, verdict: Verdict, now_s: float | None) -> CellState:
+    """The snapshot after judge's verdict; `now_s` is None for one of unknown age.
+
+    Verdict and outcome travel on their own ways: either may come first. One of an older stroke than the
+    newest fills its row and is not shown as the last.
+    """
+    index = next((i for i, row in enumerate(state.strokes) if row.cycle_id == verdict.cycle_id), None)
     row = Stroke(
         cycle_id=verdict.cycle_id,
         stroke=verdict.request.stroke,
@@ -94,7 +102,14 @@ def with_verdict(state: CellState, verdict: Verdict, now_s: float) -> CellState:
         is_simulated=verdict.is_simulated,
         object_index=verdict.request.object_index,
     )
-    return replace(state, verdict=verdict, verdict_at_s=now_s, strokes=(row, *state.strokes)[:STROKES_KEPT])
+    if index is None:
+        return replace(state, verdict=verdict, verdict_at_s=now_s, strokes=(row, *state.strokes)[:STROKES_KEPT])
+    known = state.strokes[index]
+    row = replace(row, utc=known.utc, cycle_ms=known.cycle_ms, told_code=known.told_code)
+    strokes = (*state.strokes[:index], row, *state.strokes[index + 1 :])
+    if state.verdict is not None and (index > 0 or state.verdict.cycle_id == verdict.cycle_id):
+        return replace(state, strokes=strokes)
+    return replace(state, verdict=verdict, verdict_at_s=now_s, strokes=strokes)
 
 
 def with_outcome(state: CellState, outcome: Outcome) -> CellState:
@@ -127,12 +142,17 @@ def with_outcome(state: CellState, outcome: Outcome) -> CellState:
 
 def with_view(state: CellState, view: View, now_s: float) -> CellState:
     """The snapshot with the newest maps."""
-    return replace(state, view=view, view_at_s=now_s)
+    return replace(state, view=view, view_at_s=now_s, view_before=state.view)
 
 
 def with_preview(state: CellState, preview: Preview, now_s: float) -> CellState:
-    """The snapshot with the newest camera picture."""
-    return replace(state, preview=preview, preview_at_s=now_s, preview_serial=state.preview_serial + 1)
+    """The snapshot with the newest camera picture; one that is said again keeps its age."""
+    last = state.preview
+    if last is not None and last.frame_counter == preview.frame_counter and np.array_equal(last.jpeg, preview.jpeg):
+        return replace(state, preview_heard_s=now_s)
+    return replace(
+        state, preview=preview, preview_at_s=now_s, preview_heard_s=now_s, preview_serial=state.preview_serial + 1
+    )
 
 
 def with_service(state: CellState, told: ServiceState, now_s: float) -> CellState:

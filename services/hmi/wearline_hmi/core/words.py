@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from wearline.messages import CODE_MEANING, ResultCode
+from wearline_hmi.core.language import ENGLISH, Language
 from wearline_hmi.core.state import CellState, Seen, Stroke, current_object
 
 STATE_FRESH_S = 3.0
@@ -14,28 +15,32 @@ PREVIEW_STALE_S = 3.0
 DASH = "–"
 
 
-def age_text(age_s: float | None) -> str:
+def age_text(age_s: float | None, say: Language = ENGLISH) -> str:
     """'just now', '12 s ago', '3 min ago' or '2 h 05 min ago'; a dash when nothing came yet."""
     if age_s is None:
         return DASH
     if age_s < 1.0:
-        return "just now"
+        return say("just now")
     if age_s < 120.0:
-        return f"{int(age_s)} s ago"
+        return say("{n} s ago", n=int(age_s))
     minutes = int(age_s // 60)
     if minutes < 120:
-        return f"{minutes} min ago"
+        return say("{n} min ago", n=minutes)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes:02d} min ago" if hours < 48 else f"{hours // 24} days ago"
+    return (
+        say("{hours} h {minutes:02d} min ago", hours=hours, minutes=minutes)
+        if hours < 48
+        else say("{n} days ago", n=hours // 24)
+    )
 
 
-def mm_text(value_mm: float | None, sign: bool = False) -> str:
+def mm_text(value_mm: float | None, sign: bool = False, say: Language = ENGLISH) -> str:
     """Three decimals, a true minus sign, a dash for what was not measured."""
     if value_mm is None or not math.isfinite(value_mm):
         return DASH
     if abs(value_mm) < 0.0005:
-        return "0.000"
-    return (f"{value_mm:+.3f}" if sign else f"{value_mm:.3f}").replace("-", "−")
+        return say.number("0.000")
+    return say.number(f"{value_mm:+.3f}" if sign else f"{value_mm:.3f}")
 
 
 def ms_text(value_ms: float | None) -> str:
@@ -63,7 +68,7 @@ class Sign:
     colour: str
     """green, red, amber or grey: a class of the style sheet."""
     icon: str
-    """check, cross, question, dash, warn or clock: a shape of the style sheet."""
+    """check, cross, question, dash, warn, clock or hand: a shape of the style sheet."""
     word: str
     detail: str = ""
 
@@ -93,36 +98,40 @@ def decision_sign(decision: str, detail: str = "") -> Sign:
     return Sign(colour, icon, word, detail)
 
 
-def verdict_sign(state: CellState, now_s: float, stale_after_s: float) -> VerdictSign:
+def verdict_sign(state: CellState, now_s: float, stale_after_s: float, say: Language = ENGLISH) -> VerdictSign:
     """What the big panel says at `now_s`: the newest stroke, or that there is none.
 
     An outcome that contradicts the verdict (the deadline had gone, a simulated verdict was refused)
-    rules: the panel shows what the PLC was told.
+    rules: the panel shows what the PLC was told. An old verdict keeps its shape and word and loses its colour.
     """
-    verdict, at_s = state.verdict, state.verdict_at_s
-    if verdict is None or at_s is None:
-        return VerdictSign(Sign("grey", "dash", "NO VERDICT", "No stroke was measured since this screen started"),
-                           DASH, True, False)  # fmt: skip
-    age_s = max(0.0, now_s - at_s)
-    sign = decision_sign(verdict.decision.value, verdict.reason or code_text(verdict.code))
+    verdict = state.verdict
+    if verdict is None:
+        detail = say("No stroke was measured since this screen started")
+        return VerdictSign(Sign("grey", "dash", "NO VERDICT", detail), DASH, True, False)
+    sign = decision_sign(verdict.decision.value, verdict.reason or say(code_text(verdict.code)))
     newest = next((row for row in state.strokes if row.cycle_id == verdict.cycle_id), None)
     outcome = state.outcome
     is_told = newest is not None and newest.told_code is not None
     if outcome is not None and outcome.cycle_id == verdict.cycle_id:
         if not outcome.was_told:
-            sign = Sign("amber", "warn", sign.word, f"THE PLC WAS NOT TOLD. {sign.detail}")
+            sign = Sign("amber", "warn", sign.word, f"{say('THE PLC WAS NOT TOLD.')} {sign.detail}")
         elif outcome.code >= 10 and verdict.decision.value != "NOT_MEASURED":
-            sign = decision_sign("NOT_MEASURED", code_text(outcome.code))
-    return VerdictSign(sign, age_text(age_s), age_s > stale_after_s, is_told)
+            sign = decision_sign("NOT_MEASURED", say(code_text(outcome.code)))
+    if state.verdict_at_s is None:
+        return VerdictSign(replace(sign, colour="grey"), say("before this screen started"), True, is_told)
+    age_s = max(0.0, now_s - state.verdict_at_s)
+    is_stale = age_s > stale_after_s
+    return VerdictSign(replace(sign, colour="grey") if is_stale else sign, age_text(age_s, say), is_stale, is_told)
 
 
-def service_sign(seen: Seen, now_s: float) -> Sign:
-    """Colour, shape, word and age of one service."""
+def service_sign(seen: Seen, now_s: float, say: Language = ENGLISH) -> Sign:
+    """Colour, shape and word of one service; its detail is the age of what it said."""
     age_s = None if seen.at_s is None else max(0.0, now_s - seen.at_s)
     if seen.state is None or age_s is None:
-        return Sign("red" if seen.is_alive is False else "grey", "cross" if seen.is_alive is False else "dash",
-                    "gone" if seen.is_alive is False else "not heard yet", DASH)  # fmt: skip
-    age = "now" if age_s < 1.5 else age_text(age_s).removesuffix(" ago")
+        if seen.is_alive is False:
+            return Sign("red", "cross", "gone", DASH)
+        return Sign("grey", "dash", "not heard yet", DASH)
+    age = age_text(age_s if age_s >= 1.5 else 0.0, say)
     if seen.is_alive is False or age_s > STATE_LOST_S:
         return Sign("red", "cross", "lost", age)
     if age_s > STATE_FRESH_S:
@@ -137,33 +146,48 @@ def service_sign(seen: Seen, now_s: float) -> Sign:
 class HeaderWords:
     """The line at the top."""
 
+    ready: Sign
     mode: Sign
     plc: Sign
     object_text: str
 
 
+UNKNOWN = Sign("grey", "dash", "unknown")
+
+
+def _flag(value: object, yes: Sign, no: Sign) -> Sign:
+    return UNKNOWN if value is None else yes if value else no
+
+
 def header_words(state: CellState, now_s: float) -> HeaderWords:
-    """Mode, PLC link and object; what fieldbus said too long ago is unknown, not true."""
+    """Ready, mode, PLC link and object; what fieldbus said too long ago is unknown, not true."""
     seen = state.services["fieldbus"]
     index = current_object(state)
     object_text = DASH if index is None else str(index)
     told = seen.state
     if told is None or seen.at_s is None or seen.is_alive is False or now_s - seen.at_s > STATE_LOST_S:
-        return HeaderWords(Sign("grey", "dash", "unknown"), Sign("red", "cross", "unknown"), object_text)
+        return HeaderWords(UNKNOWN, UNKNOWN, UNKNOWN, object_text)
     mode = str(told.values.get("mode") or "unknown")
-    mode_sign = Sign("green" if mode == "auto" else "amber" if mode == "manual" else "grey",
-                     "check" if mode == "auto" else "dash", mode)  # fmt: skip
-    link = told.values.get("plc_link_up")
-    if link is None:
-        plc = Sign("grey", "dash", "unknown")
-    else:
-        plc = Sign("green", "check", "up") if link else Sign("red", "cross", "DOWN")
-    return HeaderWords(mode_sign, plc, object_text)
+    mode_sign = {
+        "auto": Sign("green", "check", "auto"),
+        "manual": Sign("amber", "hand", "manual"),
+    }.get(mode, UNKNOWN)
+    return HeaderWords(
+        _flag(told.values.get("is_ready"), Sign("green", "check", "Ready"), Sign("amber", "clock", "not ready")),
+        mode_sign,
+        _flag(told.values.get("plc_link_up"), Sign("green", "check", "up"), Sign("red", "cross", "DOWN")),
+        object_text,
+    )
 
 
-def stroke_sign(row: Stroke) -> Sign:
+def stroke_sign(row: Stroke, say: Language = ENGLISH) -> Sign:
     """The verdict column: the word of the decision; amber where the PLC was told something else."""
     sign = decision_sign(row.decision)
     if row.told_code is not None and row.told_code >= 10 and row.decision in ("PASSED", "FAILED", "UNSURE"):
-        return Sign("amber", "warn", "NOT MEASURED", code_text(row.told_code))
+        return Sign("amber", "warn", "NOT MEASURED", say(code_text(row.told_code)))
     return Sign(sign.colour, sign.icon, sign.word, row.reason)
+
+
+def pass_rate_text(state: CellState, say: Language = ENGLISH) -> str:
+    """Share of the recorded strokes that passed."""
+    return DASH if not state.total else say.number(f"{100.0 * state.passed / state.total:.1f} %")

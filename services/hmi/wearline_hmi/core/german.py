@@ -1,0 +1,5 @@
+"""German, keyed by the English text."""
+
+from __future__ import annotations
+
+GERMAN: dict[str, str] = {}

@@ -1,0 +1,80 @@
+"""The newest picture and maps as plain bytes over HTTP, and the elements that show them."""
+
+from __future__ import annotations
+
+import nicegui.elements.scene  # noqa: F401  registers the three.js that surface.js imports
+from fastapi import FastAPI, HTTPException
+from fastapi.responses import Response
+from nicegui.element import Element
+
+from wearline.messages import View
+from wearline_hmi.core.maps import ViewHeader, header_json, view_bytes
+from wearline_hmi.service import HmiService
+
+
+def add_live(app: FastAPI, service: HmiService) -> None:
+    """The routes ``/live/...``."""
+
+    @app.get("/live/preview.jpg")
+    async def preview(have: int = -1) -> Response:
+        """The newest camera picture; 204 where the caller has it already or there is none."""
+        state = service.snapshot
+        now_s = service.clock()
+        headers = {"Cache-Control": "no-store"}
+        if state.preview is None or state.preview_at_s is None or state.preview_heard_s is None:
+            return Response(status_code=204, headers=headers)
+        headers["X-Serial"] = str(state.preview_serial)
+        headers["X-Age-Ms"] = f"{1000 * (now_s - state.preview_at_s):.0f}"
+        headers["X-Heard-Ms"] = f"{1000 * (now_s - state.preview_heard_s):.0f}"
+        if have == state.preview_serial:
+            return Response(status_code=204, headers=headers)
+        return Response(state.preview.jpeg.tobytes(), media_type="image/jpeg", headers=headers)
+
+    @app.get("/live/maps/{cycle_id}.bin")
+    async def maps(cycle_id: str) -> Response:
+        """float32, little-endian, [map, row, col] of one of the two newest views, else 404."""
+        state = service.snapshot
+        view = next((v for v in (state.view, state.view_before) if v is not None and v.cycle_id == cycle_id), None)
+        if view is None:
+            raise HTTPException(404, "newer strokes have replaced these maps")
+        return Response(
+            view_bytes(view),
+            media_type="application/octet-stream",
+            headers={"Cache-Control": "private, max-age=60, immutable"},
+        )
+
+
+class LivePicture(Element, component="live_picture.js"):
+    """The camera picture, polled: the newest frame wins and its age is seen."""
+
+    def __init__(self, words: dict[str, str], stale_s: float) -> None:
+        super().__init__()
+        self._props["words"] = words
+        self._props["stale-s"] = stale_s
+
+
+class Surface(Element, component="surface.js"):
+    """One map as a surface; the browser fetches the bytes itself."""
+
+    def __init__(self, words: dict[str, str]) -> None:
+        super().__init__()
+        self._props["words"] = words
+        self._props["header"] = None
+        self._props["map"] = ""
+        self._props["painting"] = "surface"
+
+    def show(self, header: ViewHeader, view: View) -> None:
+        """Show another view."""
+        if self._props["header"] is None or self._props["header"]["cycle_id"] != view.cycle_id:
+            self._props["header"] = {**header_json(header), "url": f"/live/maps/{view.cycle_id}.bin"}
+            self.update()
+
+    def choose(self, name: str) -> None:
+        """Show another map of the same view."""
+        self._props["map"] = name
+        self.update()
+
+    def paint(self, how: str) -> None:
+        """As surface, mesh or flat."""
+        self._props["painting"] = how
+        self.update()

@@ -1,0 +1,126 @@
+"""The web server: one thread with an event loop of its own, beside the loop that handles messages."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+import time
+from pathlib import Path
+
+import uvicorn
+from fastapi import FastAPI
+from nicegui import core, run, ui
+from starlette.staticfiles import StaticFiles
+
+from wearline.errors import ConfigError
+from wearline_hmi.pages.live import add_live
+from wearline_hmi.pages.overview import add_overview
+from wearline_hmi.pages.shield import Shield
+from wearline_hmi.service import HmiService
+
+LOG = logging.getLogger(__name__)
+STATIC = Path(__file__).parent / "static"
+START_S = 15.0
+STOP_S = 0.8
+RECONNECT_S = 30.0
+"""A panel that stalls for some seconds on a big picture is no lost client. [s]"""
+
+
+class WebServer:
+    """Serves until `close`; no fault of it reaches the service."""
+
+    def __init__(self, app: FastAPI, listener: socket.socket) -> None:
+        host, port = listener.getsockname()[:2]
+        self.address = f"http://{host}:{port}" if ":" not in host else f"http://[{host}]:{port}"
+        config = uvicorn.Config(
+            app,
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            timeout_graceful_shutdown=0,
+            # What a browser sends over the socket is small: clicks and texts.
+            ws_max_size=2**20,
+            limit_concurrency=500,
+        )
+        self._listener = listener
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(target=self._run, name="web", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self._server.run(sockets=[self._listener])
+        except Exception:
+            LOG.exception("the web server ended")
+
+    def wait_started(self, timeout_s: float) -> bool:
+        """Whether it serves."""
+        deadline_s = time.monotonic() + timeout_s
+        while not self._server.started and self._thread.is_alive() and time.monotonic() < deadline_s:
+            self._thread.join(0.02)
+        return self._server.started
+
+    def is_running(self) -> bool:
+        return self._thread.is_alive()
+
+    def close(self) -> None:
+        """Stop serving and free the port."""
+        self._server.should_exit = True
+        self._thread.join(STOP_S / 2)
+        if self._thread.is_alive():
+            self._server.force_exit = True
+            self._thread.join(STOP_S / 2)
+        self._listener.close()
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        listener = socket.socket(family, kind, protocol)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+    except OSError as error:
+        raise ConfigError(
+            f"the web server cannot listen there ({error.strerror or error})",
+            f"hmi: {host} port {port}",
+            "free the port or change hmi.host and hmi.port in cell.yaml",
+        ) from error
+    return listener
+
+
+def make_app(service: HmiService) -> FastAPI:
+    """All routes of one service; once in a process, as NiceGUI has one application."""
+    app = FastAPI(title="Wearline", openapi_url=None, docs_url=None, redoc_url=None)
+    app.mount("/static", StaticFiles(directory=STATIC), name="static")
+    add_live(app, service)
+    add_overview(service)
+    run.process_pool_start_method = "spawn"
+    core.sio.eio.cors_allowed_origins = []
+    ui.run_with(
+        app,
+        title="Wearline",
+        favicon=STATIC / "wearline.svg",
+        reconnect_timeout=RECONNECT_S,
+        show_welcome_message=False,
+        tailwind=False,
+        # Maps and pictures do not shrink, and packing them would hold up everybody; the network is a local one.
+        gzip_middleware_factory=None,
+    )
+    app.add_middleware(Shield, allowed_hosts=frozenset(service.settings.allowed_hosts))
+    return app
+
+
+def serve(service: HmiService) -> WebServer:
+    """Start the web server.
+
+    Raises:
+        ConfigError: the address cannot be listened on, or the server did not start.
+    """
+    listener = _listen(service.settings.host, service.settings.port)
+    server = WebServer(make_app(service), listener)
+    if not server.wait_started(START_S):
+        server.close()
+        raise ConfigError("the web server did not start", "hmi", "its log says why")
+    LOG.info("web interface at %s", server.address)
+    return server
