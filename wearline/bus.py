@@ -17,14 +17,16 @@ import zenoh.ext as zenoh_ext
 from zenoh.handlers import FifoChannel, RingChannel
 
 from wearline import metrics
-from wearline.config import CellSettings
-from wearline.errors import BusError, MessageError, WearlineError
+from wearline.access import access_control
+from wearline.config import CellSettings, TlsSettings
+from wearline.errors import BusError, ConfigError, MessageError, WearlineError
 from wearline.messages import Event, Message, ServiceState, decode, encode
 from wearline.stop import StopSignal
 from wearline.topics import QUERIES, SERVICES, STATES, TOPICS, Delivery, Query, Topic, alive_key
 
 LOG = logging.getLogger(__name__)
 
+ROUTER = "router"
 KEPT_SAMPLES = 64
 """How many messages a KEPT topic remembers for late joiners and after a link loss."""
 CHANNEL_DEPTH = 16
@@ -34,8 +36,8 @@ EMPTY_PAUSE_S = 0.05
 """Before a question that found nobody is asked once more: a queryable needs a few ms to be known everywhere."""
 
 
-def _settings(mode: str) -> zenoh.Config:
-    settings: dict[str, Any] = {
+def _plain_settings(mode: str) -> dict[str, Any]:
+    return {
         "mode": mode,
         # The router is named, so nothing is searched for, and nothing else on the plant's network is found.
         "scouting/multicast/enabled": False,
@@ -53,10 +55,41 @@ def _settings(mode: str) -> zenoh.Config:
         "timestamping/enabled": True,
         "adminspace/enabled": False,
     }
+
+
+def _settings(mode: str) -> zenoh.Config:
+    return _config(_plain_settings(mode))
+
+
+def _config(settings: dict[str, Any]) -> zenoh.Config:
     config = zenoh.Config()
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def _tls_settings(tls: TlsSettings, participant: str) -> dict[str, Any]:
+    """Each side shows its certificate.
+
+    Raises:
+        ConfigError: a file is missing.
+    """
+    certificate, key = tls.files_of(participant)
+    for path in (tls.authority, certificate, key):
+        if not os.access(path, os.R_OK):
+            raise ConfigError("cannot be read", str(path), "issue it, or correct router.tls in cell.yaml")
+    side = "listen" if participant == ROUTER else "connect"
+    return {
+        "transport/link/protocols": ["tls"],
+        "transport/link/tls": {
+            "root_ca_certificate": str(tls.authority),
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+            f"{side}_certificate": str(certificate),
+            f"{side}_private_key": str(key),
+        },
+    }
 
 
 class Bus:
@@ -66,8 +99,9 @@ class Bus:
     thread per query. After a lost link Zenoh reconnects by itself and declares everything anew.
     """
 
-    def __init__(self, cell: str, service: str, endpoint: str) -> None:
+    def __init__(self, cell: str, service: str, endpoint: str, tls: TlsSettings | None = None) -> None:
         self.cell, self.service, self.endpoint = cell, service, endpoint
+        self._tls = {} if tls is None else _tls_settings(tls, service)
         self._session: zenoh.Session | None = None
         self._publishers: dict[Topic, Any] = {}
         self._by_message = {topic.message: topic for topic in TOPICS if topic.publisher == service}
@@ -85,10 +119,15 @@ class Bus:
         halt = stop or threading.Event()
         tries = None if timeout_s is None else max(1, int(timeout_s / CONNECT_PAUSE_S))
         while not halt.is_set():
-            config = _settings("client")
-            config.insert_json5("connect/endpoints", json.dumps([self.endpoint]))
-            # One try each, so that the stop is seen between two.
-            config.insert_json5("connect/timeout_ms", "0")
+            config = _config(
+                {
+                    **_plain_settings("client"),
+                    **self._tls,
+                    "connect/endpoints": [self.endpoint],
+                    # One try each, so that the stop is seen between two.
+                    "connect/timeout_ms": 0,
+                }
+            )
             try:
                 self._session = zenoh.open(config)
                 break
@@ -352,15 +391,36 @@ class Bus:
         self._follow(watched, take, "alive")
 
 
+def router_settings(cell: CellSettings) -> dict[str, Any]:
+    """All settings of a cell's router, nested as in a configuration file of ``zenohd``.
+
+    With certificates each participant may say only what `wearline.access` allows it.
+
+    Raises:
+        ConfigError: a certificate is missing.
+    """
+    settings = {**_plain_settings("router"), "listen/endpoints": [cell.router.listen or cell.router.endpoint]}
+    if cell.router.tls is not None:
+        settings |= {**_tls_settings(cell.router.tls, ROUTER), "access_control": access_control(cell.cell)}
+    nested: dict[str, Any] = {}
+    for key, value in settings.items():
+        *folders, name = key.split("/")
+        place = nested
+        for folder in folders:
+            place = place.setdefault(folder, {})
+        place[name] = value
+    return nested
+
+
 def open_router(cell: CellSettings) -> zenoh.Session:
     """The router of a cell, until its `close`.
 
     Raises:
         BusError: the address cannot be listened on.
+        ConfigError: a certificate is missing.
     """
     listen = cell.router.listen or cell.router.endpoint
-    config = _settings("router")
-    config.insert_json5("listen/endpoints", json.dumps([listen]))
+    config = zenoh.Config.from_json5(json.dumps(router_settings(cell)))
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:

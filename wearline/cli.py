@@ -7,6 +7,7 @@ Exit 0: done; 2: cannot be done, with one line on stderr that names what, where 
 
 from __future__ import annotations
 
+import json
 import os
 import runpy
 import sys
@@ -93,14 +94,18 @@ def _run_service(arguments: Namespace) -> int:
 
 def _configure_router(parser: ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, required=True, metavar="CELL.yaml")
+    parser.add_argument("--zenohd", action="store_true", help="only print the same router's configuration for zenohd")
 
 
 def _run_router(arguments: Namespace) -> int:
-    from wearline.bus import router
+    from wearline.bus import router, router_settings
     from wearline.config import load_cell
     from wearline.log import start_log
 
     cell = load_cell(arguments.config)
+    if arguments.zenohd:
+        sys.stdout.write(json.dumps(router_settings(cell), indent=2) + "\n")
+        return 0
     start_log(cell.cell, "router")
     return router(cell)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from wearline.errors import ConfigError
 
@@ -18,12 +18,35 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
 
+class TlsSettings(Settings):
+    """Certificates (PEM): each participant proves who it is, and the router lets it say only what is its own."""
+
+    authority: Path
+    """Certificate of the authority that signed all others; relative to cell.yaml."""
+    folder: Path
+    """Holds <name>.pem and <name>-key.pem, issued to <name>.<cell>, of the services that run here and of the router;
+    relative to cell.yaml."""
+
+    def files_of(self, participant: str) -> tuple[Path, Path]:
+        """Certificate and private key of a service or of the router."""
+        return self.folder / f"{participant}.pem", self.folder / f"{participant}-key.pem"
+
+
 class RouterSettings(Settings):
     """Where the cell's router listens."""
 
     endpoint: str = Field(default="tcp/127.0.0.1:7447", pattern=r"^(tcp|tls)/.+:\d+$")
-    listen: str | None = None
+    listen: str | None = Field(default=None, pattern=r"^(tcp|tls)/.+:\d+$")
     """Where the router binds when it differs from where services connect (containers)."""
+    tls: TlsSettings | None = None
+    """Without it everybody who reaches the router is believed: for one machine or a network of the cell's own."""
+
+    @model_validator(mode="after")
+    def _encrypted_or_not(self) -> Self:
+        for address in filter(None, (self.endpoint, self.listen)):
+            if address.startswith("tls/") is (self.tls is None):
+                raise ValueError(f"{address} and the setting 'tls' go together: both, or neither")
+        return self
 
 
 class CellSettings(Settings):
@@ -71,7 +94,7 @@ def validated(kind: type[S], content: dict[str, Any], where: str) -> S:
 
 
 def load_cell(path: Path) -> CellSettings:
-    """Read cell.yaml; a relative data_dir counts from the file's own folder.
+    """Read cell.yaml; relative paths count from the file's own folder.
 
     Raises:
         ConfigError: unreadable, not YAML, or not valid.
@@ -85,7 +108,13 @@ def load_cell(path: Path) -> CellSettings:
     if not isinstance(content, dict):
         raise ConfigError("is not a mapping of settings", str(path), "start from deploy/cells/")
     cell = validated(CellSettings, {str(k): v for k, v in content.items()}, str(path))
-    return cell.model_copy(update={"data_dir": (path.parent / cell.data_dir).resolve()})
+    changes: dict[str, Any] = {"data_dir": (path.parent / cell.data_dir).resolve()}
+    if (tls := cell.router.tls) is not None:
+        found = TlsSettings(
+            authority=(path.parent / tls.authority).resolve(), folder=(path.parent / tls.folder).resolve()
+        )
+        changes["router"] = cell.router.model_copy(update={"tls": found})
+    return cell.model_copy(update=changes)
 
 
 def schema(kind: type[Settings]) -> str:

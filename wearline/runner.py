@@ -332,7 +332,7 @@ class _Life:
     def _live(self) -> None:
         service = self._build()
         server = None
-        bus = Bus(self._cell.cell, self._name, self._cell.router.endpoint)
+        bus = Bus(self._cell.cell, self._name, self._cell.router.endpoint, self._cell.router.tls)
         runner = Runner(service, bus)
         metrics.watch_disk(self._cell.cell, self._name, self._cell.data_dir / self._name)
         try:
