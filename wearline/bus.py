@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import secrets
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -102,6 +103,8 @@ class Bus:
     def __init__(self, cell: str, service: str, endpoint: str, tls: TlsSettings | None = None) -> None:
         self.cell, self.service, self.endpoint = cell, service, endpoint
         self._tls = {} if tls is None else _tls_settings(tls, service)
+        self.instance = f"{os.getpid()}-{secrets.token_hex(4)}"
+        """Tells this replica from the others of its service; new with every start."""
         self._session: zenoh.Session | None = None
         self._publishers: dict[Topic, Any] = {}
         self._by_message = {topic.message: topic for topic in TOPICS if topic.publisher == service}
@@ -249,7 +252,10 @@ class Bus:
         if topic.delivery is Delivery.LATEST:
             subscriber = self._open.declare_subscriber(key, RingChannel(1))
         elif topic.delivery is Delivery.EVERY:
-            subscriber = self._open.declare_subscriber(key, FifoChannel(CHANNEL_DEPTH))
+            # What a replica says itself it need not hear; arrays of megabytes would be read for nothing.
+            subscriber = self._open.declare_subscriber(
+                key, FifoChannel(CHANNEL_DEPTH), allowed_origin=zenoh.Locality.REMOTE
+            )
         else:
             subscriber = zenoh_ext.declare_advanced_subscriber(
                 self._open,
@@ -375,18 +381,26 @@ class Bus:
 
     def announce(self) -> None:
         """Say that this service is alive, until it closes or dies; last of all, when it can be asked."""
-        self._declared.append(self._open.liveliness().declare_token(alive_key(self.cell, self.service)))
+        key = alive_key(self.cell, self.service, self.instance)
+        self._declared.append(self._open.liveliness().declare_token(key))
 
-    def watch_alive(self, callback: Callable[[str, bool], None]) -> None:
-        """Call ``callback(service, is_alive)`` for those that are there and at every change, on a thread of its own."""
+    def watch_alive(self, callback: Callable[[str, frozenset[str]], None]) -> None:
+        """Call ``callback(service, replicas)`` for those that are there and at every change, on a thread of its own.
+
+        ``replicas`` are the instances of that service that are alive; empty = it has gone.
+        """
         watched = self._open.liveliness().declare_subscriber(
             alive_key(self.cell, "*"), FifoChannel(4 * CHANNEL_DEPTH), history=True
         )
+        there: dict[str, frozenset[str]] = {}
 
         def take(sample: zenoh.Sample) -> None:
-            service = str(sample.key_expr).split("/")[2]
+            words = str(sample.key_expr).split("/")
+            service, instance = words[2], frozenset(words[4:])
             if service in SERVICES:
-                callback(service, sample.kind == zenoh.SampleKind.PUT)
+                known = there.get(service, frozenset())
+                there[service] = known | instance if sample.kind == zenoh.SampleKind.PUT else known - instance
+                callback(service, there[service])
 
         self._follow(watched, take, "alive")
 

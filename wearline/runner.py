@@ -67,7 +67,12 @@ class _Alive:
     is_alive: bool
 
 
-_Item = _Arrived | _Asked | _Alive
+@dataclass(frozen=True)
+class _Replicas:
+    live: frozenset[str]
+
+
+_Item = _Arrived | _Asked | _Alive | _Replicas
 
 
 class Inbox:
@@ -136,6 +141,7 @@ class Runner:
         self._started_s = self._turned_s = clock()
         self._arrived_s: dict[Topic, float] = {}
         self._told_s: dict[str, float] = {}
+        self._there: dict[str, bool] = {}
         self._health = Health("starting")
 
     def stop(self) -> None:
@@ -163,7 +169,7 @@ class Runner:
     def run(self) -> None:
         """Start, serve until `stop`, close."""
         service, bus = self._service, self._bus
-        service.wake = self._inbox.wake
+        service.wake, service.instance = self._inbox.wake, bus.instance
         for name in SERVICES:
             metrics.SERVICE_UP.labels(bus.cell, name).set(0.0)
         try:
@@ -187,9 +193,14 @@ class Runner:
         if (dropped := self._inbox.put(_Arrived(topic, message))) is not None and topic.delivery is not Delivery.LATEST:
             self._bus.count_drop(dropped, "overrun")
 
-    def _put_alive(self, name: str, is_alive: bool) -> None:
-        metrics.SERVICE_UP.labels(self._bus.cell, name).set(float(is_alive))
-        self._inbox.put(_Alive(name, is_alive))
+    def _put_alive(self, name: str, replicas: frozenset[str]) -> None:
+        is_alive = bool(replicas)
+        if self._there.get(name) is not is_alive:
+            self._there[name] = is_alive
+            metrics.SERVICE_UP.labels(self._bus.cell, name).set(float(is_alive))
+            self._inbox.put(_Alive(name, is_alive))
+        if name == self._bus.service:
+            self._inbox.put(_Replicas(replicas))
 
     def _answer(self, query: Query, question: Message) -> Message:
         """On the query's thread: wait until the service's thread has answered."""
@@ -219,6 +230,8 @@ class Runner:
                 self._reply(item, answers[item.query])
             elif isinstance(item, _Alive):
                 self._do("alive", partial(self._service.on_alive, item.service, item.is_alive))
+            elif isinstance(item, _Replicas):
+                self._do("replicas", partial(self._service.on_replicas, item.live))
             now_s = self._clock()
             if is_woken or (period_s is not None and now_s >= next_tick_s):
                 self._do("tick", partial(self._service.tick, now_s))

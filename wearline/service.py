@@ -48,6 +48,8 @@ class Service:
     name: ClassVar[str]
     wake: Callable[[], None] = staticmethod(_nobody_to_wake)
     """Set by the runner before `start`: call it from any thread and `tick` runs at once."""
+    instance: str = ""
+    """Set by the runner before `start`: tells this replica from the others of its service."""
     tick_s: float | None = None
     """Period of `tick`; None = no tick. [s]"""
 
@@ -69,6 +71,10 @@ class Service:
 
     def on_alive(self, service: str, is_alive: bool) -> Iterable[Message]:
         """A service of the cell came (also those that were there before) or went."""
+        return ()
+
+    def on_replicas(self, live: frozenset[str]) -> Iterable[Message]:
+        """The replicas of this service that are alive, itself included, whenever they change."""
         return ()
 
     def health(self) -> Health:

@@ -88,6 +88,6 @@ QUERIES: tuple[Query, ...] = (
 )  # fmt: skip
 
 
-def alive_key(cell: str, service: str) -> str:
-    """The liveliness token that stands beside a service's state."""
-    return f"wearline/{cell}/{service}/alive"
+def alive_key(cell: str, service: str, instance: str = "*") -> str:
+    """The liveliness token that stands beside a service's state, one for each replica; ``*`` = all of them."""
+    return f"wearline/{cell}/{service}/alive/{instance}"

@@ -32,7 +32,7 @@ def test_every_service_has_state_and_event() -> None:
 
 
 def test_no_query_lives_on_a_topics_key() -> None:
-    published = {topic.key("c1") for topic in TOPICS} | {alive_key("c1", service) for service in SERVICES}
+    published = {topic.key("c1") for topic in TOPICS} | {alive_key("c1", service, "1-ab") for service in SERVICES}
     assert not published & {query.key("c1") for query in QUERIES}
     assert len({query.key("c1") for query in QUERIES}) == len(QUERIES)
 

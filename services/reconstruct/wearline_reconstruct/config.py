@@ -19,6 +19,8 @@ class ReconstructSettings(Settings):
     numbering: NumberingSettings = NumberingSettings()
     smoothing: SmoothingSettings = SmoothingSettings()
     calibration: CalibrationSettings = CalibrationSettings()
+    step_in_after_s: float = 0.4
+    """With several replicas: the second one for a frame measures it when the first one is so late. [s]"""
     ask_timeout_s: float = 0.5
     """How long judge may take to answer for a recipe or an artifact. [s]"""
 

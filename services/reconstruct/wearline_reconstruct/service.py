@@ -6,6 +6,7 @@ import hashlib
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, ClassVar
 
@@ -30,14 +31,17 @@ from wearline.messages import (
 from wearline.metrics import counter
 from wearline.recipe import parse_recipe
 from wearline.service import Asker, Health, Service
-from wearline.topics import ARTIFACT, FRAME, RECIPE, Topic
+from wearline.topics import ARTIFACT, FRAME, LINE_POINTS, RECIPE, Topic
 from wearline_reconstruct.config import ReconstructSettings
 from wearline_reconstruct.core.chain import Prepared, prepare, reconstruct
+from wearline_reconstruct.core.ranking import ranked
 from wearline_reconstruct.drivers.artifact_cache import ArtifactCache
 
 FRAMES = counter("wearline_reconstructed_total", "Frames reconstructed, and how that went", ("cell", "result"))
 
 _KEPT_OBJECTS = 8
+_KEPT_FRAMES = 2
+"""Frames of megabytes that wait for another replica; older ones are past their deadline anyway."""
 _NOTHING = np.zeros((0, 5), np.float32)
 
 
@@ -45,9 +49,19 @@ class Reconstruct(Service):
     """Turns each frame into line points, by the object's recipe and references."""
 
     name: ClassVar[str] = "reconstruct"
+    tick_s = 0.1
 
-    def __init__(self, cell: str, settings: ReconstructSettings, cache: ArtifactCache) -> None:
+    def __init__(
+        self,
+        cell: str,
+        settings: ReconstructSettings,
+        cache: ArtifactCache,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._cell = cell
+        self._clock = clock
+        self._live: frozenset[str] = frozenset()
+        self._held: OrderedDict[str, _Held] = OrderedDict()
         self._settings = settings
         self._cache = cache
         self._asker: Asker | None = None
@@ -62,10 +76,42 @@ class Reconstruct(Service):
         return ()
 
     def handlers(self) -> Mapping[Topic, Callable[[Any], Iterable[Message]]]:
-        return {FRAME: self.on_frame}
+        return {FRAME: self.on_frame, LINE_POINTS: self.on_line_points}
 
     def on_frame(self, frame: Frame) -> Iterator[Message]:
-        """One LinePoints per frame: the heights, or the reason why there are none."""
+        """One LinePoints per frame, from the replica that ranks first for its cycle.
+
+        The second one keeps the frame and steps in when the first one goes or is late. Nobody after that: a
+        frame that ends two replicas would end them all.
+        """
+        first, second, *_ = [*ranked(frame.cycle_id, self._live | {self.instance}), ""]
+        if first == self.instance:
+            yield from self._measure(frame)
+        elif second == self.instance:
+            self._held[frame.cycle_id] = _Held(frame, first, self._clock() + self._settings.step_in_after_s)
+            while len(self._held) > _KEPT_FRAMES:
+                self._held.popitem(last=False)
+
+    def on_line_points(self, points: LinePoints) -> Iterable[Message]:
+        """Another replica has measured; judge drops the second of two equal answers."""
+        self._held.pop(points.cycle_id, None)
+        return ()
+
+    def on_replicas(self, live: frozenset[str]) -> Iterator[Message]:
+        self._live = live
+        yield from self._step_in(lambda held: held.leader not in live)
+
+    def tick(self, now_s: float) -> Iterator[Message]:
+        clock_s = self._clock()
+        yield from self._step_in(lambda held: clock_s >= held.due_s)
+
+    def _step_in(self, is_due: Callable[[_Held], bool]) -> Iterator[Message]:
+        for held in [held for held in self._held.values() if is_due(held)]:
+            del self._held[held.frame.cycle_id]
+            yield from self._measure(held.frame)
+
+    def _measure(self, frame: Frame) -> Iterator[Message]:
+        """The heights, or the reason why there are none."""
         if frame.refusal_code:
             answer = self._refusal(frame, frame.refusal_code, frame.refusal, None)
         else:
@@ -194,6 +240,16 @@ class Reconstruct(Service):
         self._refused += 1
         now = datetime.now(UTC).isoformat(timespec="milliseconds")
         yield Event(service=self.name, level="warning", text=answer.refusal, utc=now, cycle_id=answer.cycle_id)
+
+
+@dataclass(frozen=True)
+class _Held:
+    """A frame that another replica ought to measure."""
+
+    frame: Frame
+    leader: str
+    due_s: float
+    """When to stop waiting for it (monotonic). [s]"""
 
 
 class _RefusedError(Exception):

@@ -32,13 +32,13 @@ from wearline.topics import EVENTS, MEASURE, PREVIEW, STATES, VERDICT, Query, To
 class NotingBus:
     """A bus without a network; `say` and `ask_it` play the other side."""
 
-    cell, service, is_connected = "c1", "fieldbus", True
+    cell, service, instance, is_connected = "c1", "fieldbus", "1-ab", True
 
     def __init__(self) -> None:
         self.said = Heard()
         self.callbacks: dict[Topic, Callable[[Any], None]] = {}
         self.answerers: dict[Query, Callable[[Any], m.Message]] = {}
-        self.alive: Callable[[str, bool], None] = lambda name, is_alive: None
+        self.alive: Callable[[str, frozenset[str]], None] = lambda name, replicas: None
         self.is_announced = threading.Event()
         self.drops: list[tuple[str, str]] = []
 
@@ -51,7 +51,7 @@ class NotingBus:
     def answer(self, query: Query, fn: Callable[[Any], m.Message]) -> None:
         self.answerers[query] = fn
 
-    def watch_alive(self, callback: Callable[[str, bool], None]) -> None:
+    def watch_alive(self, callback: Callable[[str, frozenset[str]], None]) -> None:
         self.alive = callback
 
     def announce(self) -> None:
@@ -107,6 +107,9 @@ class Probe(Service):
 
     def on_alive(self, service: str, is_alive: bool) -> Iterable[m.Message]:
         yield event(f"{service} {is_alive}")
+
+    def on_replicas(self, live: frozenset[str]) -> Iterable[m.Message]:
+        yield event(f"replicas {' '.join(sorted(live))}")
 
     def tick(self, now_s: float) -> Iterable[m.Message]:
         self.threads.add(threading.get_ident())
@@ -205,8 +208,10 @@ def test_ticks_keep_their_period_while_messages_flow() -> None:
 
 
 def test_state_and_liveliness_are_told(running: Running) -> None:
-    running.bus.alive("judge", False)
+    running.bus.alive("judge", frozenset())
     running.bus.said.wait_for(lambda items: any("judge False" in str(item) for item in items))
+    running.bus.alive("fieldbus", frozenset({"1-ab", "2-cd"}))
+    running.bus.said.wait_for(lambda items: any("replicas 1-ab 2-cd" in str(item) for item in items))
     states = [message for message in running.bus.said.items if isinstance(message, m.ServiceState)]
     assert states[0].status == "ready"
     assert states[0].values == {"plc_link_up": True}
