@@ -160,7 +160,7 @@ def test_what_is_kept_reaches_who_comes_late_and_who_is_alive_is_known(
     fieldbus.subscribe(VERDICTS, heard)
     fieldbus.watch_alive(alive)
     assert [v.reason for v in heard.wait_for(lambda items: len(items) == 3)] == ["0", "1", "2"]
-    alive.wait_for(lambda items: items == [("judge", True)])
+    alive.wait_for(lambda items: items == [("judge", frozenset({judge.instance}))])
 
 
 # --- what is not allowed reaches nobody ---
@@ -211,10 +211,10 @@ def test_a_forged_sign_of_life_reaches_nobody(
     alive = Heard()
     join("fieldbus").watch_alive(alive)
     session = pretend("hmi", certificates)
-    tokens = [session.liveliness().declare_token(alive_key("c1", name)) for name in ("judge", "hmi")]
+    tokens = [session.liveliness().declare_token(alive_key("c1", name, "1-ab")) for name in ("judge", "hmi")]
     # Its own is passed on, and came later.
     alive.wait_for(bool)
-    assert alive.items == [("hmi", True)]
+    assert alive.items == [("hmi", frozenset({"1-ab"}))]
     del tokens
 
 
