@@ -144,7 +144,11 @@ def _steps(gap: F32, rise: F32, sigma: F32) -> NDArray[np.bool_]:
         beside[1:] = np.fmax(beside[1:], np.nan_to_num(size[:-1]))
         beside[:-1] = np.fmax(beside[:-1], np.nan_to_num(size[1:]))
         # How far a line moves per mm is read from the frame: neighbours that jump also change their distance.
-        usual = np.nanmedian(gap, axis=0, keepdims=True) if gap.size else gap
+        usual = np.full_like(gap[:1], np.nan)
+        # Beyond a region of interest there is no line at all.
+        known = np.isfinite(gap).any(axis=0)
+        if known.any():
+            usual[:, known] = np.nanmedian(gap[:, known], axis=0)
         moved = np.abs(gap - usual)
         floor = np.maximum(6.0 * np.maximum(sigma[1:], sigma[:-1]), 0.02)
         return np.asarray((size > _STEP_RATIO * beside + floor) & (moved > _STEP_SHARE * usual))

@@ -27,7 +27,7 @@ def _between_lines(values: F64, across: F64, positions: F64) -> F64:
     a0, a1 = across[below, column], across[above, column]
     with np.errstate(invalid="ignore", divide="ignore"):
         share = (positions[:, None] - a0) / (a1 - a0)
-    mixed = values[below, column] * (1.0 - share) + values[above, column] * share
+        mixed = values[below, column] * (1.0 - share) + values[above, column] * share
     return np.where((upper > 0) & (upper < lines), mixed, np.nan)
 
 
