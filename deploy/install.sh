@@ -38,8 +38,8 @@ ours() {
         pip wheel -q --no-deps --no-build-isolation --wheel-dir /tmp/wheels "$folder"
     done
     pip --python /opt/wearline/bin/python install -q --no-compile --no-deps --no-index /tmp/wheels/*.whl
-    # Tests and C headers of third parties are of no use beside a press.
-    find /opt/wearline -type d \( -name tests -o -name test \) -path '*/site-packages/*' -prune -exec rm -rf {} +
+    # Third parties' tests and C headers are of no use beside a press.
+    find /opt/wearline -type d \( -name tests -o -name include \) -path '*/site-packages/*' -prune -exec rm -rf {} +
     # The root file system is read-only: compiled once, here. Hashes instead of dates keep the layer reproducible.
     python3 -m compileall -q -j 0 --invalidation-mode unchecked-hash /opt/wearline/lib || true
     case $service in

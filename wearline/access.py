@@ -51,7 +51,7 @@ ASKS: dict[str, tuple[Query, ...]] = {
     "capture": (),
     "reconstruct": (RECIPE, ARTIFACT),
     "judge": (JOURNAL,),
-    "fieldbus": (RECIPE_LIST,),
+    "fieldbus": (RECIPE,),
     "hmi": (
         RECIPE, RECIPE_LIST, RECORDS, TEACH, DIE_EVENT, DO_MEASURE, SELECT_OBJECT, MODE, SET_CAMERA,
     ),

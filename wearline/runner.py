@@ -155,8 +155,10 @@ class Runner:
         """
         age_s = self._clock() - self._turned_s
         health, is_connected = self._health, self._bus.is_connected
-        is_well = age_s < HUNG_S and is_connected and health.status in ("ready", "degraded")
+        is_alive = age_s < HUNG_S
+        is_well = is_alive and is_connected and health.status in ("ready", "degraded")
         return is_well, {
+            "alive": is_alive,
             "service": self._bus.service,
             "cell": self._bus.cell,
             "status": health.status,

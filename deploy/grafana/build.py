@@ -41,7 +41,10 @@ ROWS: tuple[tuple[str, int, tuple[Panel, ...]], ...] = (
     (
         "The cell now", 5,
         (
-            Panel("Services", ((f"wearline_service_up{CELL}", "{{service}}"),), "none", 10, "stat", words=UP),
+            Panel(
+                "Services", ((f"min by (service) (wearline_service_up{CELL})", "{{service}}"),), "none", 10, "stat",
+                words=UP,
+            ),
             Panel("PLC link", ((f"wearline_plc_link_up{CELL}", "PLC"),), "none", 3, "stat", words=UP),
             Panel(
                 "Parts per minute", ((f"60 * cell:wearline_cycles:rate5m{CELL}", ""),), "none", 3, "stat",

@@ -57,7 +57,9 @@ def stages() -> dict[str, list[str]]:
 
 def test_every_stage_starts_from_the_one_base_or_from_another_stage() -> None:
     origins = {name: lines[0].split()[1] for name, lines in stages().items()}
-    assert origins == {"base": "${BASE}", "build": "base", "prometheus": "${BASE}", "service": "base"}
+    assert origins == {
+        "base": "${BASE}", "build": "base", "package": "${BASE}", "prometheus": "${BASE}", "service": "base"
+    }  # fmt: skip
     assert re.search(r"^ARG BASE=debian:bookworm-slim$", DOCKERFILE, re.MULTILINE)
     assert "latest" not in DOCKERFILE
 

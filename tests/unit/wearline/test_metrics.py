@@ -48,6 +48,9 @@ def test_it_serves_metrics_and_health() -> None:
         assert get(server.port, "/healthz?x") == (200, json.dumps({"status": "ready"}))
         state[0] = (False, {"status": "starting"})
         assert get(server.port, "/healthz") == (503, json.dumps({"status": "starting"}))
+        assert get(server.port, "/livez")[0] == 200
+        state[0] = (False, {"alive": False})
+        assert get(server.port, "/livez") == (503, json.dumps({"alive": False}))
         assert get(server.port, "/secrets")[0] == 404
         with pytest.raises(ConfigError, match=f"127.0.0.1:{server.port}: cannot listen"):
             metrics.serve("127.0.0.1", server.port, lambda: state[0])
