@@ -363,17 +363,17 @@ def _measured(found: Fragments, number: I64, spot_found: bool, prepared: Prepare
     label[line, along] = found.label[keep]
     starts = _piece_starts(label, grid_z)
     point = slope * np.sqrt(fast**2 + texture**2)
-    steep = float(np.median(slope[::9])) ** 2
+    steep = float(np.median(slope[::19])) ** 2
     process = _process_noise(
-        grid_z, steep * float(np.median(fast[::9])) ** 2, length, steep * float(np.median(texture[::9])) ** 2,
+        grid_z, steep * float(np.median(fast[::19])) ** 2, length, steep * float(np.median(texture[::19])) ** 2,
         streak, prepared.settings.smoothing.reach_px,
     )  # fmt: skip
     smoothed = smooth(grid_z, grid_sigma, starts, 1.0, process, prepared.settings.smoothing)
     z_raw, z = z, smoothed.z_mm[line, along]
-    missed = _misfit(grid_z - smoothed.z_mm, float(np.median((slope * fast)[::9])), length)[line, along]
+    missed = _misfit(grid_z - smoothed.z_mm, float(np.median((slope * fast)[::19])), length)[line, along]
     posterior = np.hypot(np.minimum(smoothed.sigma_mm[line, along], point), missed)
     is_rejected = np.abs(z_raw - z) > 6.0 * np.hypot(point, missed)
-    vibration = float(calibration.meta.get("vibration_px", 0.05)) * float(np.median(slope[::9])) if len(slope) else 0.0
+    vibration = float(calibration.meta.get("vibration_px", 0.05)) * float(np.median(slope[::19])) if len(slope) else 0.0
     common = float(np.hypot(vibration, float(calibration.meta.get("z_sigma_common_mm", 0.0))))
     sigma = np.sqrt(posterior**2 + calibration.z_sigma_mm[line, along] ** 2 + vibration**2)
     good = np.isfinite(z) & np.isfinite(sigma) & ~is_rejected
@@ -436,6 +436,7 @@ def _piece_starts(label: I64, z: F64) -> Bool:
 
 
 _LAGS = (8, 16, 32, 64, 128)
+_CELL = 4
 _SURE = 3.0
 """A bend that stands out by this many standard deviations is followed."""
 
@@ -453,36 +454,44 @@ def _process_noise(z: F64, fast_mm2: float, fast_px: float, slow_mm2: float, slo
         slow_mm2: and by streaks that are alike over ``slow_px``.
         reach_px: length over which a surface that shows no bends is averaged.
     """
-    have = np.isfinite(z).astype(np.float32)
-    filled = np.where(have > 0, z, 0.0).astype(np.float32)
+    lines, size = z.shape
+    cells = size // _CELL
     long_run = fast_mm2 * fast_px + slow_mm2 * slow_px
-    process = np.full(z.shape, long_run / reach_px**4, np.float32)
-    size = z.shape[1]
-    for lag in _LAGS:
-        if size <= 4 * lag:
-            continue
-        count = cv2.blur(have, (lag, 1), borderType=cv2.BORDER_CONSTANT)
-        mean = cv2.blur(filled, (lag, 1), borderType=cv2.BORDER_CONSTANT)
-        mean = np.where(count > 0.6, mean / np.maximum(count, 0.6), np.float32(np.nan))
-        third = mean[:, 3 * lag :] - mean[:, : -3 * lag] + 3.0 * (mean[:, lag : -2 * lag] - mean[:, 2 * lag : -lag])
-        limit = _SURE**2 * 20.0 * (fast_mm2 * min(fast_px / lag, 1.0) + slow_mm2 * min(slow_px / lag, 1.0))
+    process = np.full((lines, cells), long_run / reach_px**4, np.float32)
+    # Means over a few pixels say all at these lags.
+    whole = z[:, : cells * _CELL].astype(np.float32).reshape(lines, cells, _CELL)
+    have = np.isfinite(whole)
+    filled = np.where(have, whole, np.float32(0.0)).sum(axis=2)
+    weight = have.sum(axis=2, dtype=np.float32)
+    for lag in (n for n in _LAGS if 4 * n < size):
+        step = lag // _CELL
+        count = cv2.boxFilter(weight, -1, (step, 1), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        mean = cv2.boxFilter(filled, -1, (step, 1), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        mean /= np.maximum(count, 1.0)
+        mean[count < 0.6 * lag] = np.nan
+        third = mean[:, 3 * step :] - mean[:, : -3 * step]
+        third += np.float32(3.0) * (mean[:, step : -2 * step] - mean[:, 2 * step : -step])
         third[np.isnan(third)] = 0.0
+        limit = _SURE**2 * 20.0 * (fast_mm2 * min(fast_px / lag, 1.0) + slow_mm2 * min(slow_px / lag, 1.0))
         three = cv2.blur(third, (1, 3), borderType=cv2.BORDER_REPLICATE)
-        np.multiply(third, third, out=third)
-        np.multiply(three, three, out=three)
+        third *= third
+        three *= three
         third[third < limit] = 0.0
         three[three < limit / 3.0] = 0.0
-        bend = np.maximum(third, three)
-        if not bend.any():
+        np.maximum(third, three, out=third)
+        if not third.any():
             continue
+        # Short bends are sharp and want all of it; long ones are followed as well with less.
+        third *= np.float32(min(8.0 / lag, 1.0) / lag**3)
         # A bend lies anywhere within the reach of the difference that shows it.
-        widened = cv2.dilate(bend * np.float32(min(8.0 / lag, 1.0) / lag**3), np.ones((1, 2 * lag + 1), np.uint8))
-        start = 3 * lag // 2
-        process[:, start : start + widened.shape[1]] = np.maximum(process[:, start : start + widened.shape[1]], widened)
+        widened = cv2.dilate(third, np.ones((1, 2 * step + 1), np.uint8))
+        start = 3 * step // 2
+        stop = start + widened.shape[1]
+        np.maximum(process[:, start:stop], widened, out=process[:, start:stop])
         np.maximum(process[:, :start], widened[:, :1], out=process[:, :start])
-        tail = start + widened.shape[1]
-        np.maximum(process[:, tail:], widened[:, -1:], out=process[:, tail:])
-    return process.astype(np.float64)
+        np.maximum(process[:, stop:], widened[:, -1:], out=process[:, stop:])
+    full = np.repeat(process, _CELL, axis=1).astype(np.float64)
+    return np.pad(full, ((0, 0), (0, size - full.shape[1])), mode="edge")
 
 
 def _misfit(residual: F64, fast_mm: float, length: float) -> F64:

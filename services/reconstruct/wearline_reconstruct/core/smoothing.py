@@ -13,6 +13,7 @@ prediction hardly enters (innovation gate).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,7 @@ class SmoothingSettings(Settings):
     """A point further off the prediction than this many standard deviations counts less and less."""
     reach_px: float = 60.0
     """Scale over which a surface that shows no bends is smoothed: about three times as many points count. [px]"""
-    overlap_px: int = 128
+    overlap_px: int = 96
     """Run-in of each piece; longer than the memory of the filter. [px]"""
 
 
@@ -57,23 +58,46 @@ def smooth(
         correlation_px: points that share one independent error. [px]
         process_mm2: (line, along), variance that the slope gains per pixel. [mm^2/px^3]
     """
-    lines, size = z_mm.shape
     if not np.isfinite(z_mm).any():
         return Smoothed(z_mm.copy(), sigma_mm.copy())
+    # Two neighbours make one step: they were averaged over more before, and it halves the time.
+    lines, along = z_mm.shape
+    size = -(-along // 2)
+    pair = _pairs(z_mm, np.nan)
+    z = pair.mean(axis=2)
+    seen = np.isfinite(z)
     # Neighbouring points share their error, so that each brings only its share of news.
-    variance = np.where(np.isfinite(z_mm), sigma_mm**2 * max(correlation_px, 1.0), np.inf)
-    ends = np.zeros_like(starts)
-    ends[:, :-1] = _next_start(starts, np.isfinite(z_mm))
+    variance = np.where(seen, _pairs(sigma_mm, np.nan).mean(axis=2) ** 2 * (0.5 * max(correlation_px, 1.0)), np.inf)
+    process = 8.0 * _pairs(process_mm2, 0.0).max(axis=2)
+    begins = _pairs(starts, False)
+    # Where two pieces meet within a step, the second one has it.
+    start = begins.any(axis=2)
+    z[begins[:, :, 1] & np.isfinite(pair[:, :, 0])] = np.nan
+    ends = np.zeros_like(start)
+    ends[:, :-1] = _next_start(start, np.isfinite(pair).any(axis=2))
     span = -(-size // _PIECES)
-    run_in = min(settings.overlap_px, size)
-    forward = _lanes(z_mm, variance, process_mm2, starts, span, run_in)
-    backward = _lanes(z_mm[:, ::-1], variance[:, ::-1], process_mm2[:, ::-1], ends[:, ::-1], span, run_in)
+    run_in = min(settings.overlap_px // 2, size)
+    forward = _lanes(z, variance, process, start, span, run_in)
+    backward = _lanes(z[:, ::-1], variance[:, ::-1], process[:, ::-1], ends[:, ::-1], span, run_in)
     both = (np.concatenate([f, b], axis=1) for f, b in zip(forward, backward, strict=True))
     # Filtered from the left, predicted from the right: each point counts once.
     filtered, predicted = _filter(*both, gate=settings.gate_sigma**2, run_in=run_in)
     left = _whole(filtered, lines, span, size)
     right = _whole(predicted, lines, span, size)[:, :, ::-1]
-    return _fused(z_mm, left, right)
+    height, slope, sigma = _fused(left, right)
+    apart = slope[:, :, None] * np.array([-0.25, 0.25])
+    single = np.isfinite(z_mm)
+    full = (height[:, :, None] + apart).reshape(lines, 2 * size)[:, :along]
+    spread = np.repeat(sigma, 2, axis=1)[:, :along]
+    return Smoothed(np.where(single, full, np.nan), np.where(single, spread, np.nan))
+
+
+def _pairs(values: NDArray[Any], fill: float | bool) -> NDArray[Any]:
+    """(line, along) as (line, step, 2)."""
+    lines, along = values.shape
+    if along % 2:
+        values = np.concatenate([values, np.full((lines, 1), fill, values.dtype)], axis=1)
+    return values.reshape(lines, -1, 2)
 
 
 def _next_start(starts: Bool, seen: Bool) -> Bool:
@@ -162,18 +186,18 @@ def _whole(state: F64, lines: int, span: int, size: int) -> F64:
     return np.asarray(shaped[:, :, :size])
 
 
-def _fused(z: F64, left: F64, right: F64) -> Smoothed:
-    """Two independent estimates of (z, slope) at each point, weighed by their covariances."""
+def _fused(left: F64, right: F64) -> tuple[F64, F64, F64]:
+    """Two independent estimates of (z, slope) at each step, weighed by their covariances: z, slope, sigma of z."""
     lz, ls, l00, l01, l11 = left
     rz, rs, r00, r01, r11 = right
     # The backward slope runs the other way.
     rs, r01 = -rs, -r01
     s00, s01, s11 = l00 + r00, l01 + r01, l11 + r11
     det = np.maximum(s00 * s11 - s01 * s01, 1e-30)
-    dz, ds = rz - lz, rs - ls
-    gain0 = (l00 * s11 - l01 * s01) / det
-    gain1 = (l01 * s00 - l00 * s01) / det
-    fused = lz + gain0 * dz + gain1 * ds
-    variance = np.maximum(l00 - gain0 * l00 - gain1 * l01, 1e-12)
-    seen = np.isfinite(z)
-    return Smoothed(np.where(seen, fused, np.nan), np.where(seen, np.sqrt(variance), np.nan))
+    dz, ds = (rz - lz) / det, (rs - ls) / det
+    # The gain of the height applies to both, that of the slope likewise.
+    turn_z, turn_s = s11 * dz - s01 * ds, s00 * ds - s01 * dz
+    height = lz + l00 * turn_z + l01 * turn_s
+    slope = ls + l01 * turn_z + l11 * turn_s
+    lost = (l00 * s11 - l01 * s01) / det * l00 + (l01 * s00 - l00 * s01) / det * l01
+    return height, slope, np.sqrt(np.maximum(l00 - lost, 1e-12))

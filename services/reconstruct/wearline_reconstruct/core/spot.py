@@ -43,6 +43,12 @@ def find_spots(strip: Image, scale: Scale, search: Search | None = None, most: i
     over the pattern; what stands out compactly from it is the spot (or a glint).
     """
     pitch = scale.pitch_px if np.isfinite(scale.pitch_px) else 16.0 * scale.width_px
+    if search is not None:
+        return _within(strip, search, pitch, most)
+    return _candidates(strip, pitch, None, most)
+
+
+def _candidates(strip: Image, pitch: float, search: Search | None, most: int) -> list[Spot]:
     small = cv2.resize(strip, None, fx=1.0 / _SHRINK, fy=1.0 / _SHRINK, interpolation=cv2.INTER_AREA)
     small = small.astype(np.float32)
     unit = pitch / _SHRINK
@@ -78,6 +84,30 @@ def find_spots(strip: Image, scale: Scale, search: Search | None = None, most: i
         reach = round(unit) + 1
         allowed[max(along - reach, 0) : along + reach + 1, max(across - reach, 0) : across + reach + 1] = 0
     return found
+
+
+_MARGIN_PITCHES = 6.0
+"""What the statistics of the light need about the part that is searched."""
+
+
+def _within(strip: Image, search: Search, pitch: float, most: int) -> list[Spot]:
+    """As `find_spots`, with no more than the neighbourhood of the search touched."""
+    windows = []
+    for (low, high), size in ((search.along_px, strip.shape[0]), (search.across_px, strip.shape[1])):
+        begin = int(max(low - _MARGIN_PITCHES * pitch, 0.0)) // _SHRINK * _SHRINK
+        windows.append(slice(begin, int(max(min(high + _MARGIN_PITCHES * pitch + 1.0, size), begin))))
+    along, across = windows
+    part = strip[along, across]
+    if min(part.shape) < 4 * _SHRINK:
+        return []
+    inside = Search(
+        (search.along_px[0] - along.start, search.along_px[1] - along.start),
+        (search.across_px[0] - across.start, search.across_px[1] - across.start), search.least_excess,
+    )  # fmt: skip
+    return [
+        Spot(s.along_px + along.start, s.across_px + across.start, s.excess)
+        for s in _candidates(part, pitch, inside, most)
+    ]
 
 
 def _located(strip: Image, pitch: float, along: float, across: float, excess: float) -> Spot:
