@@ -9,6 +9,7 @@ from wearline_reconstruct.core.lines import LineSettings
 from wearline_reconstruct.core.numbering import NumberingSettings
 from wearline_reconstruct.core.smoothing import SmoothingSettings
 from wearline_reconstruct.core.stripes import StripeSettings
+from wearline_reconstruct.core.thesis import ThesisSettings
 
 
 class ReconstructSettings(Settings):
@@ -18,6 +19,7 @@ class ReconstructSettings(Settings):
     lines: LineSettings = LineSettings()
     numbering: NumberingSettings = NumberingSettings()
     smoothing: SmoothingSettings = SmoothingSettings()
+    thesis: ThesisSettings = ThesisSettings()
     calibration: CalibrationSettings = CalibrationSettings()
     step_in_after_s: float = 0.4
     """With several replicas: the second one for a frame measures it when the first one is so late. [s]"""
@@ -27,4 +29,4 @@ class ReconstructSettings(Settings):
     @property
     def chain(self) -> ChainSettings:
         """The settings of the measuring chain."""
-        return ChainSettings(self.stripes, self.lines, self.numbering, self.smoothing)
+        return ChainSettings(self.stripes, self.lines, self.numbering, self.smoothing, self.thesis)

@@ -40,6 +40,7 @@ from wearline_reconstruct.core.stripes import (
     strip_image,
     stripe_peaks,
 )
+from wearline_reconstruct.core.thesis import ThesisSettings, rounding_mm, spatial_kalman, thesis_fragments, thesis_peaks
 
 _STREAK_PX = 60.0
 """Length of streaks of rolled sheet: points within it share the error that they cause. [px]"""
@@ -53,6 +54,7 @@ class ChainSettings:
     lines: LineSettings = field(default_factory=LineSettings)
     numbering: NumberingSettings = field(default_factory=NumberingSettings)
     smoothing: SmoothingSettings = field(default_factory=SmoothingSettings)
+    thesis: ThesisSettings = field(default_factory=ThesisSettings)
 
 
 @dataclass(frozen=True)
@@ -192,9 +194,16 @@ def reconstruct(pixels: Image, prepared: Prepared, clock_s: Callable[[], float] 
     rows, cols = (int(v) for v in calibration.image_shape)
     check_pixels(pixels, (rows, cols))
     strip = strip_image(pixels, calibration.is_vertical)
-    peaks = stripe_peaks(strip, prepared.scale, settings.stripes, prepared.recipe.method)
+    by_thesis = prepared.recipe.method == "thesis"
+    if by_thesis:
+        peaks = thesis_peaks(strip, prepared.scale, settings.stripes, settings.thesis)
+    else:
+        peaks = stripe_peaks(strip, prepared.scale, settings.stripes)
     lap("stripes")
-    found = fragments(peaks, prepared.scale, settings.stripes.average_px, settings.lines)
+    if by_thesis:
+        found = thesis_fragments(peaks, prepared.scale, settings.thesis)
+    else:
+        found = fragments(peaks, prepared.scale, settings.stripes.average_px, settings.lines)
     check_stripes(found, peaks, int(prepared.expected.sum()))
     lap("lines")
     number, spot = _numbered(strip, found, prepared)
@@ -349,30 +358,11 @@ def _measured(found: Fragments, number: I64, spot_found: bool, prepared: Prepare
         )  # fmt: skip
     keep, line, along, across, z = keep[valid], line[valid], along[valid], across[valid], z[valid]
     slope = np.abs(height_slope(calibration, line, along, across))
-    texture = _texture_px(found, keep, prepared)
-    fast = found.sigma_px[keep].astype(np.float64)
-
-    grid_z = np.full((lines, along_size), np.nan)
-    grid_sigma = np.full((lines, along_size), np.nan)
-    label = np.full((lines, along_size), -1, np.int64)
-    grid_z[line, along] = z
-    length = max(found.correlation_px, 1.0)
-    streak = float(calibration.meta.get("streak_px", _STREAK_PX))
-    long_run = np.sqrt(fast**2 * length + texture**2 * streak)
-    grid_sigma[line, along] = slope * long_run
-    label[line, along] = found.label[keep]
-    starts = _piece_starts(label, grid_z)
-    point = slope * np.sqrt(fast**2 + texture**2)
-    steep = float(np.median(slope[::19])) ** 2
-    process = _process_noise(
-        grid_z, steep * float(np.median(fast[::19])) ** 2, length, steep * float(np.median(texture[::19])) ** 2,
-        streak, prepared.settings.smoothing.reach_px,
-    )  # fmt: skip
-    smoothed = smooth(grid_z, grid_sigma, starts, 1.0, process, prepared.settings.smoothing)
-    z_raw, z = z, smoothed.z_mm[line, along]
-    missed = _misfit(grid_z - smoothed.z_mm, float(np.median((slope * fast)[::19])), length)[line, along]
-    posterior = np.hypot(np.minimum(smoothed.sigma_mm[line, along], point), missed)
-    is_rejected = np.abs(z_raw - z) > 6.0 * np.hypot(point, missed)
+    places = _Places(keep, line, along, z, slope)
+    if recipe.method == "thesis":
+        z, posterior, is_rejected = _filtered_by_thesis(found, places, prepared)
+    else:
+        z, posterior, is_rejected = _smoothed(found, places, prepared)
     vibration = float(calibration.meta.get("vibration_px", 0.05)) * float(np.median(slope[::19])) if len(slope) else 0.0
     common = float(np.hypot(vibration, float(calibration.meta.get("z_sigma_common_mm", 0.0))))
     sigma = np.sqrt(posterior**2 + calibration.z_sigma_mm[line, along] ** 2 + vibration**2)
@@ -397,6 +387,55 @@ def _measured(found: Fragments, number: I64, spot_found: bool, prepared: Prepare
     wanted = int((expected.sum(axis=1) > 0.1 * along_size).sum())
     quality = describe(found, seen, max(wanted, seen), spot_found, calibration.stripe_width_px, coverage)
     return _Measured(points, common, coverage, quality)
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Numbered points, [n]."""
+
+    keep: I64
+    """Their peaks."""
+    line: I64
+    along: I64
+    z_mm: F64
+    slope_mm_per_px: F64
+
+
+def _smoothed(found: Fragments, places: _Places, prepared: Prepared) -> tuple[F64, F64, Bool]:
+    """Smoothed heights [mm], their standard uncertainty without what is common to the frame [mm], and outliers."""
+    calibration, line, along = prepared.calibration, places.line, places.along
+    slope, z = places.slope_mm_per_px, places.z_mm
+    texture = _texture_px(found, places.keep, prepared)
+    fast = found.sigma_px[places.keep].astype(np.float64)
+    shape = calibration.across0_px.shape
+    grid_z, grid_sigma = np.full(shape, np.nan), np.full(shape, np.nan)
+    label = np.full(shape, -1, np.int64)
+    grid_z[line, along] = z
+    length = max(found.correlation_px, 1.0)
+    streak = float(calibration.meta.get("streak_px", _STREAK_PX))
+    grid_sigma[line, along] = slope * np.sqrt(fast**2 * length + texture**2 * streak)
+    label[line, along] = found.label[places.keep]
+    point = slope * np.sqrt(fast**2 + texture**2)
+    steep = float(np.median(slope[::19])) ** 2
+    process = _process_noise(
+        grid_z, steep * float(np.median(fast[::19])) ** 2, length, steep * float(np.median(texture[::19])) ** 2,
+        streak, prepared.settings.smoothing.reach_px,
+    )  # fmt: skip
+    starts = _piece_starts(label, grid_z)
+    smoothed = smooth(grid_z, grid_sigma, starts, 1.0, process, prepared.settings.smoothing)
+    missed = _misfit(grid_z - smoothed.z_mm, float(np.median((slope * fast)[::19])), length)[line, along]
+    result = smoothed.z_mm[line, along]
+    posterior = np.hypot(np.minimum(smoothed.sigma_mm[line, along], point), missed)
+    return result, posterior, np.asarray(np.abs(z - result) > 6.0 * np.hypot(point, missed))
+
+
+def _filtered_by_thesis(found: Fragments, places: _Places, prepared: Prepared) -> tuple[F64, F64, Bool]:
+    """As `_smoothed`, by the thesis' iterations."""
+    sigma = rounding_mm(places.slope_mm_per_px, found.sigma_px[places.keep].astype(np.float64))
+    grid_z = np.full(prepared.calibration.across0_px.shape, np.nan)
+    grid_z[places.line, places.along] = places.z_mm
+    filtered = spatial_kalman(grid_z, float(np.median(sigma[::19])), prepared.settings.thesis.iterations)
+    return filtered.z_mm[places.line, places.along], sigma, np.zeros(len(sigma), bool)
 
 
 def _one_each(number: I64, found: Fragments, shape: tuple[int, int]) -> I64:

@@ -67,6 +67,14 @@ def fragments(peaks: Peaks, scale: Scale, average_px: int, settings: LineSetting
     return Fragments(peaks.take(order), label, sigma[order], length)
 
 
+def ordered_fragments(peaks: Peaks, label: I64, scale: Scale, average_px: int, shortest_px: int) -> Fragments:
+    """Fragments from peaks that bear labels already, without the short ones."""
+    order, label = _longer(peaks, label, shortest_px)
+    peaks = peaks.take(order)
+    sigma, length = position_noise(peaks, label, scale, average_px)
+    return Fragments(peaks, label, sigma, length)
+
+
 def _smeared_ends(peaks: Peaks, label: I64, reach: int) -> Bool:
     """Peaks beyond the true end of a line: averaging along it shows them there."""
     first = np.ones(len(label), bool)

@@ -71,7 +71,7 @@ def smooth(
     process = 8.0 * _pairs(process_mm2, 0.0).max(axis=2)
     begins = _pairs(starts, False)
     # Where two pieces meet within a step, the second one has it.
-    start = begins.any(axis=2)
+    start: Bool = np.asarray(begins.any(axis=2))
     z[begins[:, :, 1] & np.isfinite(pair[:, :, 0])] = np.nan
     ends = np.zeros_like(start)
     ends[:, :-1] = _next_start(start, np.isfinite(pair).any(axis=2))

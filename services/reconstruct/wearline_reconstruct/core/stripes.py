@@ -13,7 +13,7 @@ centre as the top does, and the root weighs them nearly as the best linear estim
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -201,35 +201,47 @@ def _runs(mask: NDArray[np.uint8]) -> tuple[I64, I64, I64]:
     return row, start - base, stop - base
 
 
-def stripe_peaks(
-    strip: Image, scale: Scale, settings: StripeSettings, method: Literal["wearline", "thesis"] = "wearline"
-) -> Peaks:
-    """All stripe peaks of a strip image [along, across] of uint8, or float32 in DN of an 8-bit frame.
-
-    ``method="thesis"`` keeps the middle of the run of stripe pixels, as equation 4-3 gives it.
-    """
+def background_offset(near: Image, scale: Scale, settings: StripeSettings) -> tuple[Image, float, float]:
+    """Local mean of an averaged image, how far a stripe must rise above it, and the noise of the background. [DN]"""
     pitch = scale.pitch_px if np.isfinite(scale.pitch_px) else 20.0 * scale.width_px
     window = _odd(min(pitch, max(14.0 * scale.width_px, 9.0)))
-    length = max(settings.average_px | 1, 1)
-    inner = _odd(1.6 * scale.width_px)
-    near = cv2.blur(strip, (inner, length), borderType=cv2.BORDER_REPLICATE)
     around = cv2.blur(near, (window, 1), borderType=cv2.BORDER_REFLECT_101)
     sparse = near[::23].astype(np.float32)
     noise = _background_noise(sparse - around[::23], sparse, scale.width_px)
-    offset = max(settings.threshold_noise * noise, settings.threshold_dn)
+    return around, max(settings.threshold_noise * noise, settings.threshold_dn), noise
+
+
+def _stripe_runs(near: Image, around: Image, offset: float) -> tuple[I64, I64, I64]:
+    """Runs above the local mean (equation 4-3 with an offset): along, first and one past last across."""
     _, mask = cv2.threshold(cv2.subtract(near, around), offset, 255, cv2.THRESH_BINARY)
-    along, start, stop = _runs(np.asarray(mask).astype(np.uint8, copy=False))
+    return _runs(np.asarray(mask).astype(np.uint8, copy=False))
+
+
+def run_peaks(near: Image, around: Image, offset: float, noise: float) -> Peaks:
+    """The middle pixel of each run: what section 4.3.2 of the thesis calls the line.
+
+    An even run has two; to the even one of them, so that there is no bias to one side.
+    """
+    along, start, stop = _stripe_runs(near, around, offset)
+    middle = np.rint(0.5 * (start + stop - 1)).astype(np.int64)
+    height = near[along, middle].astype(np.float32)
+    low = around[along, middle].astype(np.float32)
+    return Peaks(
+        along.astype(np.int32), middle.astype(np.float32), height - low,
+        ((stop - start) / _FULL_WIDTH).astype(np.float32), low, height >= 254.0, noise,
+    )  # fmt: skip
+
+
+def stripe_peaks(strip: Image, scale: Scale, settings: StripeSettings) -> Peaks:
+    """All stripe peaks of a strip image [along, across] of uint8, or float32 in DN of an 8-bit frame."""
+    pitch = scale.pitch_px if np.isfinite(scale.pitch_px) else 20.0 * scale.width_px
+    length = max(settings.average_px | 1, 1)
+    inner = _odd(1.6 * scale.width_px)
+    near = cv2.blur(strip, (inner, length), borderType=cv2.BORDER_REPLICATE)
+    around, offset, noise = background_offset(near, scale, settings)
+    along, start, stop = _stripe_runs(near, around, offset)
     long_enough = stop - start >= max(2, int(0.8 * scale.width_px))
     along, start, stop = along[long_enough], start[long_enough], stop[long_enough]
-    noise_dn = float(noise)
-    if method == "thesis":
-        centre = 0.5 * (start + stop - 1)
-        height = near[along, (start + stop - 1) // 2].astype(np.float32)
-        low = around[along, (start + stop - 1) // 2].astype(np.float32)
-        return Peaks(
-            along.astype(np.int32), centre.astype(np.float32), height - low,
-            ((stop - start) / _FULL_WIDTH).astype(np.float32), low, height >= 254.0, noise_dn,
-        )  # fmt: skip
     along, seed = _seeds(near, along, start, stop, scale)
     if strip.dtype == np.uint8:
         # Whole sums of a few pixels: exact in 16 bit, half the memory traffic of floats.
@@ -238,7 +250,7 @@ def stripe_peaks(
     else:
         summed = _averaged(strip, length)
         share = np.float32(1.0)
-    return _refined(summed, share, along, seed, scale, pitch, noise_dn)
+    return _refined(summed, share, along, seed, scale, pitch, float(noise))
 
 
 def _seeds(near: Image, along: I64, start: I64, stop: I64, scale: Scale) -> tuple[I64, I64]:
