@@ -226,6 +226,8 @@ class ZoneResult(Message):
     wear_mm: float | None
     coverage: float
     is_within: bool
+    profile_mm: float | None = None
+    """Profile of the surface in the style of ISO 1101: twice the largest absolute deviation. [mm]"""
 
 
 class RegistrationResult(Message):
@@ -236,8 +238,12 @@ class RegistrationResult(Message):
     tilt_y_mrad: float = 0.0
     dx_mm: float = 0.0
     dy_mm: float = 0.0
+    turn_mrad: float = 0.0
+    """In plane, from x to y. [mrad]"""
     undetermined: tuple[str, ...] = ()
     """Directions that the surface does not determine; left at zero."""
+    datum: str = Field(default="best fit", pattern="^(best fit|zones)$")
+    """What deviations refer to: a best fit to the whole part, or to the recipe's datum zones."""
 
 
 class Verdict(FromCycle):
@@ -253,6 +259,9 @@ class Verdict(FromCycle):
     """Signed, measured minus template. [mm]"""
     wear_mm: float | None = None
     """95th percentile of the absolute deviation in the largest significant region; 0 when none. [mm]"""
+    profile_mm: float | None = None
+    """Profile of the surface in the style of ISO 1101, by `registration.datum`: twice the largest absolute
+    deviation. [mm]"""
     deviating_area_mm2: float | None = None
     deviating_area_px: int | None = None
     coverage: float = 0.0

@@ -31,12 +31,15 @@ REGION = m.Region(
     row_px=10.5, col_px=20.5, box_px=(1, 2, 3, 4),
 )  # fmt: skip
 ZONE = m.ZoneResult(
-    name="radius", mean_error_mm=0.1, max_error_mm=None, area_mm2=3.0, wear_mm=0.2, coverage=0.9, is_within=False
-)
+    name="radius", mean_error_mm=0.1, max_error_mm=None, area_mm2=3.0, wear_mm=0.2, coverage=0.9, is_within=False,
+    profile_mm=0.6,
+)  # fmt: skip
 VERDICT = m.Verdict(
     **CYCLE, request=REQUEST, decision=m.Decision.FAILED, code=2, reason="worn", mean_error_mm=0.12, max_error_mm=-0.3,
-    wear_mm=0.25, deviating_area_mm2=20.5, deviating_area_px=900, coverage=0.98, regions=(REGION,), zones=(ZONE,),
-    registration=m.RegistrationResult(dz_mm=0.01, undetermined=("dx",)), quality=QUALITY, timings_ms={"judge": 5.5},
+    wear_mm=0.25, profile_mm=0.6, deviating_area_mm2=20.5, deviating_area_px=900, coverage=0.98, regions=(REGION,),
+    zones=(ZONE,),
+    registration=m.RegistrationResult(dz_mm=0.01, turn_mrad=-0.2, undetermined=("dx",), datum="zones"), quality=QUALITY,
+    timings_ms={"judge": 5.5},
     frame_hash="f", calibration_hash="c", template_hash="t", recipe_hash="r", code_version="1",
 )  # fmt: skip
 OUTCOME = m.Outcome(

@@ -1,7 +1,13 @@
 """Deviation of a part from its template on the laser lines, and the connected regions of it.
 
 A cell is `BLOCK` points of one line; it stands for the sensor area between its line's neighbours.
-Decisions rest on cells, so on measured heights alone; nothing is interpolated between lines.
+Decisions rest on cells, so on measured heights alone; nothing of the part is interpolated.
+
+The uncertainty of a cell has two parts. Noise (of the part and of the template) is what reconstruct
+states without what is common to the frame, since registration removes that, and scaled by what
+neighbouring lines really scatter: streaks of the sheet and light that falls on one half of it are
+no surprise then. Guesses between the template's lines are alike along a line, and the rest is alike
+over a whole region: spread of good parts, place on a slope, the registration itself.
 """
 
 from __future__ import annotations
@@ -17,25 +23,171 @@ from wearline.config import Settings
 from wearline.messages import Region
 from wearline.recipe import Zone
 from wearline_judge.core.golden import Golden, sample
-from wearline_judge.core.line_grid import BLOCK, F64, Bool, LineGrid, block_mean, block_sum
-from wearline_judge.core.registration import Motion, RegistrationSettings, register
+from wearline_judge.core.line_grid import BLOCK, BLOCK_SEEN, F64, Bool, block_mean, block_sum
+from wearline_judge.core.registration import Cells, Motion, RegistrationSettings, register
 
 
 class ComparisonSettings(Settings):
     """When a deviation is believed."""
 
     cell_significance: float = Field(default=3.0, ge=0)
-    """A cell deviates when it does so by this many standard uncertainties, and by the precision."""
+    """A cell, or the mean of its neighbourhood, starts a region when it deviates by this many standard uncertainties
+    and by the precision."""
     region_significance: float = Field(default=1.645, ge=0)
     """A region counts when its mean exceeds the precision by this many standard uncertainties (one-sided 95 %)."""
-    correlation_px: float = Field(default=24.0, gt=0)
-    """Distance along a line over which errors are alike. [px]"""
+    region_existence: float = Field(default=5.0, ge=0)
+    """And when its mean is this many standard uncertainties from zero: a part has hundreds of places where noise
+    could make a region."""
+    correlation_px: float = Field(default=120.0, gt=0)
+    """Distance along a line at which errors are no longer alike. [px]"""
     position_sigma_mm: float = Field(default=0.01, ge=0)
     """Standard uncertainty of where a point lies, felt through the slope. [mm]"""
     area_floor_px: float = Field(default=2500.0, ge=0)
     """Stands for the recipe's area_floor_mm2 where no lateral scale is known. [px]"""
     half_pitch_share: float = Field(default=0.5, gt=0, le=1)
     """A point further than this share of the pitch from the template's line is not compared."""
+
+
+@dataclass(frozen=True)
+class TemplateCells:
+    """The template laid out in cells for one region of interest; made once. Arrays are (line, block)."""
+
+    wanted: Bool
+    """(line, along): points of the template that a part should show."""
+    expected: F64
+    """Points of the template in each cell."""
+    x_px: F64
+    y_px: F64
+    """Middle of each cell on the template, NaN = none. [px]"""
+    z_mm: F64
+    slope_x: F64
+    slope_y: F64
+    """Rise of the template. [mm/px]"""
+    offset_mm: F64
+    """Mean height of the cell minus the template's map at its middle. [mm]"""
+    noise_mm2: F64
+    """Variance of the template's mean height. [mm^2]"""
+    natural_mm2: F64
+    """Variance among good parts. [mm^2]"""
+    area_px: F64
+    middle_px: tuple[float, float]
+    """x, y about which a part turns. [px]"""
+    middle_z_mm: float
+
+
+def template_cells(golden: Golden, inside: Bool | None) -> TemplateCells:
+    """Lay out a template.
+
+    Args:
+        golden: the template.
+        inside: (line, along), points of the recipe's ROI; None = all.
+    """
+    wanted = golden.is_expected if inside is None else golden.is_expected & inside
+    x, y = block_mean(golden.x_px, wanted), block_mean(golden.y_px, wanted)
+    z = block_mean(golden.z_mm, wanted)
+    at = (x - golden.roi[0], y - golden.roi[1])
+    slope_x, slope_y = (np.nan_to_num(sample(field, *at)) for field in (golden.slope_x, golden.slope_y))
+    has = np.isfinite(x)
+    pitch = block_mean(golden.pitch_px, np.isfinite(golden.pitch_px))
+    return TemplateCells(
+        wanted=wanted,
+        expected=block_sum(wanted),
+        x_px=x,
+        y_px=y,
+        z_mm=z,
+        slope_x=slope_x,
+        slope_y=slope_y,
+        offset_mm=z - sample(golden.near_mm, *at),
+        noise_mm2=np.nan_to_num(block_mean(golden.variance_mm2, wanted)),
+        natural_mm2=np.nan_to_num(block_mean(golden.natural_mm2, wanted)),
+        area_px=np.where(np.isfinite(pitch), pitch, 0.0) * BLOCK,
+        middle_px=(float(np.mean(x[has])), float(np.mean(y[has]))) if has.any() else (0.0, 0.0),
+        middle_z_mm=float(np.mean(z[has])) if has.any() else 0.0,
+    )
+
+
+@dataclass(frozen=True)
+class PartCells:
+    """What one frame showed, means over the points of each cell; (line, block), NaN = not seen."""
+
+    seen: F64
+    """Points of the template that were seen."""
+    x_px: F64
+    y_px: F64
+    z_mm: F64
+    variance_mm2: F64
+    """Mean variance of the points, common part included. [mm^2]"""
+
+
+def part_cells(points: NDArray[np.float32], golden: Golden, cells: TemplateCells, share: float) -> PartCells:
+    """Gather line points [n, 5] (line, row_px, col_px, z_mm, sigma_mm) into the template's cells.
+
+    A point counts where the template has one, within `share` of the pitch of it; points that are not
+    finite or lie outside the grid do not, nor does a second one at the same place.
+    """
+    lines, along = golden.z_mm.shape
+    blocks = -(-along // BLOCK)
+    finite = np.isfinite(points).all(axis=1) if len(points) else np.zeros(0, bool)
+    line_f, row, col, z, sigma = points[finite].T.astype(np.float64)
+    across, along_f = (col, row) if golden.is_vertical else (row, col)
+    line, place = np.rint(line_f).astype(np.int64), np.rint(along_f).astype(np.int64)
+    keep = (line >= 0) & (line < lines) & (place >= 0) & (place < along)
+    index = np.where(keep, line * along + place, 0)
+    near = np.abs(across - golden.across_px.ravel()[index]) <= share * golden.pitch_px.ravel()[index]
+    keep &= cells.wanted.ravel()[index] & near
+    if np.bincount(index[keep], minlength=1).max(initial=0) > 1:
+        first = np.zeros(len(index), bool)
+        kept = np.flatnonzero(keep)
+        first[kept[np.unique(index[kept], return_index=True)[1]]] = True
+        keep = first
+    cell = (line * blocks + place // BLOCK)[keep]
+    size = lines * blocks
+    seen = np.bincount(cell, minlength=size).astype(np.float64)
+    enough = seen >= BLOCK_SEEN
+    means = [
+        np.where(enough, np.bincount(cell, v[keep], size) / np.maximum(seen, 1.0), np.nan).reshape(lines, blocks)
+        for v in (across, along_f, z, sigma * sigma)
+    ]
+    across_mean, along_mean = means[0], means[1]
+    x, y = (across_mean, along_mean) if golden.is_vertical else (along_mean, across_mean)
+    return PartCells(seen.reshape(lines, blocks), x, y, means[2], means[3])
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """What a deviation is uncertain by, (line, block), one standard uncertainty each. [mm]"""
+
+    noise_mm: F64
+    """Alike over a short distance along a line, independent from line to line."""
+    guess_mm: F64
+    """Alike along a line, independent from line to line."""
+    common_mm: F64
+    """Alike over a whole region."""
+    correlation_px: float
+    """Distance along a line at which noise is no longer alike. [px]"""
+
+    @property
+    def sigma_mm(self) -> F64:
+        """All of it. [mm]"""
+        return np.sqrt(self.noise_mm**2 + self.guess_mm**2 + self.common_mm**2)
+
+    def of_mean(self, at: Bool, area: F64) -> float:
+        """Standard uncertainty of the area-weighted mean over the cells `at`. [mm]"""
+        rows, blocks = np.nonzero(at)
+        if not rows.size:
+            return 0.0
+        window = (slice(int(rows.min()), int(rows.max()) + 1), slice(int(blocks.min()), int(blocks.max()) + 1))
+        inside = at[window]
+        share = np.where(inside, area[window], 0.0)
+        share = share / share.sum()
+        noise, guess, common = (
+            np.where(inside, share * a[window], 0.0) for a in (self.noise_mm, self.guess_mm, self.common_mm)
+        )
+        reach = max(int(np.ceil(self.correlation_px / BLOCK)), 1)
+        kernel = np.clip(1.0 - np.abs(np.arange(-reach, reach + 1)) * BLOCK / self.correlation_px, 0.0, None)[None, :]
+        alike = cv2.filter2D(noise, -1, kernel, borderType=cv2.BORDER_CONSTANT)
+        variance = float(np.sum(noise * alike)) + float(np.sum(guess.sum(axis=1) ** 2)) + float(common.sum()) ** 2
+        return float(np.sqrt(variance))
 
 
 @dataclass(frozen=True)
@@ -46,6 +198,7 @@ class Comparison:
     """Measured minus template after registration; NaN = not compared. [mm]"""
     sigma_mm: F64
     """Its standard uncertainty. [mm]"""
+    doubt: Doubt
     area_px: F64
     label: NDArray[np.int32]
     """0 = within precision, else the number of a significant region, from 1."""
@@ -55,14 +208,16 @@ class Comparison:
     regions: tuple[Region, ...]
     """Significant ones, largest first."""
     motion: Motion
-    point_deviation_mm: F64
-    """(line, along). [mm]"""
 
     @property
     def coverage(self) -> float:
         """Share of the template's points that were seen, 0-1."""
         total = float(self.expected.sum())
         return float(self.seen.sum()) / total if total else 0.0
+
+    def mean_sigma(self, at: Bool) -> float:
+        """Standard uncertainty of the area-weighted mean deviation of the cells `at`. [mm]"""
+        return self.doubt.of_mean(at, self.area_px)
 
 
 def polygon_mask(zone: Zone, x_px: F64, y_px: F64) -> Bool:
@@ -82,23 +237,13 @@ def block_position(golden: Golden) -> tuple[F64, F64]:
     return block_mean(golden.x_px, expected), block_mean(golden.y_px, expected)
 
 
-def _against(golden: Golden, part: LineGrid, shift_px: tuple[float, float]) -> F64:
-    """(line, along): measured minus template, the template moved in plane by `shift_px`. [mm]"""
-    along = np.broadcast_to(np.arange(part.z_mm.shape[1], dtype=np.float64), part.z_mm.shape)
-    x, y = (part.across_px, along) if golden.is_vertical else (along, part.across_px)
-    x, y = x - shift_px[0], y - shift_px[1]
-    at_map = sample(golden.map_mm, x - golden.roi[0], y - golden.roi[1]) + golden.map_offset_mm
-    on_line = golden.z_mm + golden.slope_x * (x - golden.x_px) + golden.slope_y * (y - golden.y_px)
-    return part.z_mm - np.where(np.isfinite(at_map), at_map, on_line)
-
-
 def compare(
     golden: Golden,
-    part: LineGrid,
+    cells: TemplateCells,
+    points: NDArray[np.float32],
     precision_mm: F64,
     area_floor_mm2: float,
     datum: Bool | None,
-    inside: Bool | None,
     sigma_frame_mm: float,
     settings: ComparisonSettings,
     registration: RegistrationSettings,
@@ -106,131 +251,215 @@ def compare(
     """Register a part and find where it deviates.
 
     Args:
-        golden: the template.
-        part: what the frame showed.
+        golden, cells: the template.
+        points: [n, 5], what the frame showed.
         precision_mm: (line, block), deviation above which a cell counts. [mm]
         area_floor_mm2: smaller regions do not count. [mm^2]
         datum: (line, block), cells that the registration may use; None = all.
-        inside: (line, along), points of the recipe's ROI; None = all.
         sigma_frame_mm: share of the points' uncertainty that is common to the frame. [mm]
         settings, registration: thresholds.
     """
-    wanted = golden.is_expected if inside is None else golden.is_expected & inside
-    near = np.abs(part.across_px - golden.across_px) <= settings.half_pitch_share * golden.pitch_px
-    valid = wanted & part.is_seen & near
+    part = part_cells(points, golden, cells, settings.half_pitch_share)
     scale = golden.mm_per_pixel
     unit = scale or 1.0
-    x_px, y_px = block_position(golden)
-    has_cells = np.isfinite(x_px)
-    middle_x = float(np.mean(x_px[has_cells])) if has_cells.any() else 0.0
-    middle_y = float(np.mean(y_px[has_cells])) if has_cells.any() else 0.0
-    x, y = (x_px - middle_x) * unit, (y_px - middle_y) * unit
-    slope_x = block_mean(golden.slope_x, golden.is_expected) / unit
-    slope_y = block_mean(golden.slope_y, golden.is_expected) / unit
+    place = Cells(
+        (part.x_px - cells.middle_px[0]) * unit,
+        (part.y_px - cells.middle_px[1]) * unit,
+        cells.z_mm - cells.middle_z_mm if scale else np.zeros(part.z_mm.shape),
+        cells.slope_x / unit,
+        cells.slope_y / unit,
+        golden.camera_distance_mm if scale else float("inf"),
+    )
+    noise2 = np.maximum(part.variance_mm2 - sigma_frame_mm**2, 0.1 * part.variance_mm2) + cells.noise_mm2
 
-    natural = np.clip(golden.spread_mm**2 - part.sigma_mm**2, 0.0, None)
-    variance = block_mean(part.sigma_mm**2 + golden.variance_mm2 + natural, valid)
-    use = datum if datum is not None else np.ones(x.shape, bool)
-    # The map knows the part at a distance, the linear model only next to it: a second look from the shifted place.
-    motion = Motion()
-    shift_px = (0.0, 0.0)
-    for turn in range(2):
-        raw = _against(golden, part, shift_px)
-        cells = block_mean(raw, valid)
-        step = register(
-            cells, np.sqrt(variance), x, y, slope_x, slope_y, use, registration, scale is not None, datum is not None
-        )
-        motion = Motion(
-            step.dz_mm, step.tilt_x, step.tilt_y, motion.dx + step.dx, motion.dy + step.dy,
-            step.undetermined, step.scale_mm, step.shift_sigma or motion.shift_sigma,
-        )  # fmt: skip
-        if turn == 1 or not (step.dx or step.dy):
-            break
-        shift_px = (motion.dx / unit, motion.dy / unit)
-    motion = _held(motion, registration, scale is not None, datum is not None)
-    rest_x, rest_y = motion.dx - shift_px[0] * unit, motion.dy - shift_px[1] * unit
-    cells = cells - motion.height(x, y) + slope_x * rest_x + slope_y * rest_y
-    px, py = golden.x_px - middle_x, golden.y_px - middle_y
-    points = raw - motion.height(px * unit, py * unit) + (golden.slope_x * rest_x + golden.slope_y * rest_y) / unit
-    steepness = np.hypot(slope_x, slope_y)
-    place = np.hypot(settings.position_sigma_mm if scale else settings.position_sigma_mm * 10.0, motion.shift_sigma)
-    sigma = np.sqrt(variance + (steepness * place) ** 2)
+    def residual(motion: Motion) -> tuple[F64, F64]:
+        expected, guess = _moved_template(golden, cells, part, place, motion, unit)
+        return part.z_mm - expected, guess
 
-    area = golden.block_area_px
-    seen, expected = block_sum(valid), block_sum(wanted)
-    with np.errstate(invalid="ignore"):
-        deviates = np.abs(cells) > np.maximum(precision_mm, settings.cell_significance * sigma)
+    def flat_residual(motion: Motion) -> tuple[F64, F64]:
+        deviation, guess = residual(motion)
+        return deviation.ravel(), np.sqrt(noise2 + cells.natural_mm2 + guess**2).ravel()
+
+    flat_place = Cells(
+        place.x.ravel(), place.y.ravel(), place.height_mm.ravel(), place.slope_x.ravel(), place.slope_y.ravel(),
+        place.distance,
+    )  # fmt: skip
+    use = datum if datum is not None else np.ones(part.z_mm.shape, bool)
+    motion = register(flat_residual, flat_place, use.ravel(), registration, scale is not None, datum is not None)
+    deviation, guess = residual(motion)
+
+    steepness = np.hypot(place.slope_x, place.slope_y)
+    position = np.hypot(settings.position_sigma_mm if scale else settings.position_sigma_mm * 10.0, motion.shift_sigma)
+    common2 = cells.natural_mm2 + (steepness * position) ** 2 + motion.height_sigma_mm**2
+    usual = float(np.nanmedian(noise2)) if np.isfinite(noise2).any() else 0.0
+    # What reconstruct states above the usual (steep walls, ends of lines) has its own reasons.
+    scatter = _scatter(deviation, noise2, common2 + guess**2)
+    noise2 = noise2 + (scatter - 1.0) * np.minimum(noise2, usual)
+    doubt = Doubt(np.sqrt(noise2), guess, np.sqrt(common2), settings.correlation_px)
+    sigma = doubt.sigma_mm
+
     floor_px = area_floor_mm2 / scale**2 if scale else (settings.area_floor_px if area_floor_mm2 > 0 else 0.0)
-    label, regions = _regions(
-        np.asarray(deviates & np.isfinite(cells)), cells, sigma, area, x_px, y_px, precision_mm, floor_px, scale,
-        sigma_frame_mm, settings,
-    )  # fmt: skip
-    return Comparison(cells, sigma, area, label, expected, seen, regions, motion, np.where(valid, points, np.nan))
+    label, regions = _regions(deviation, doubt, sigma, cells, precision_mm, floor_px, scale, settings)
+    seen = np.minimum(part.seen, cells.expected)
+    return Comparison(deviation, sigma, doubt, cells.area_px, label, cells.expected, seen, regions, motion)
 
 
-def _held(motion: Motion, settings: RegistrationSettings, is_in_mm: bool, has_datum: bool) -> Motion:
-    """The motion with its shift inside its bound, where no datum zone vouches for it."""
-    limit = settings.shift_max_mm if is_in_mm else settings.shift_max_px
-    length = float(np.hypot(motion.dx, motion.dy))
-    if has_datum or length <= limit:
-        return motion
-    share = limit / length
-    return Motion(
-        motion.dz_mm, motion.tilt_x, motion.tilt_y, motion.dx * share, motion.dy * share,
-        motion.undetermined, motion.scale_mm, motion.shift_sigma,
-    )  # fmt: skip
+def _moved_template(
+    golden: Golden, cells: TemplateCells, part: PartCells, place: Cells, motion: Motion, unit: float
+) -> tuple[F64, F64]:
+    """(line, block): height of the template moved by `motion` where the part was seen, and its doubt. [mm]"""
+    u, v = motion.move(place)
+    x, y = part.x_px - u / unit, part.y_px - v / unit
+    at = (x - golden.roi[0], y - golden.roi[1])
+    at_map = sample(golden.near_mm, *at) + cells.offset_mm
+    on_line = cells.z_mm + cells.slope_x * (x - cells.x_px) + cells.slope_y * (y - cells.y_px)
+    height = np.where(np.isfinite(at_map), at_map, on_line) + motion.rise(place)
+    return height, np.nan_to_num(sample(golden.doubt_mm, *at))
 
 
-def mean_sigma(sigma: F64, area: F64, sigma_frame_mm: float, correlation_px: float) -> float:
-    """Standard uncertainty of an area-weighted mean of cells whose neighbours along a line err alike. [mm]"""
-    share = area / area.sum()
-    own = np.clip(sigma**2 - sigma_frame_mm**2, 0.0, None)
-    alike = min(max(correlation_px / BLOCK, 1.0), float(share.size))
-    return float(np.sqrt(alike * np.sum(share**2 * own) + sigma_frame_mm**2))
+_TILE = (29, 9)
+"""Blocks along and lines across of the tiles over which scatter is judged: 230 px, so that light on half of a
+picture is seen, and large against a flake, whose edges are scatter too."""
+_SCATTER_PRIOR = 60.0
+"""Cells that the scatter of the whole part counts for against those of a tile."""
+_MEDIAN_OF_SQUARE = 0.4549
+"""Of a normal deviate of variance 1."""
+
+
+def _scatter(deviation: F64, noise2: F64, rest2: F64) -> F64:
+    """(line, block): real over stated variance of the noise, from second differences between neighbouring lines.
+
+    Wear is smooth from line to line, or ends at an edge that a median forgets; noise is neither.
+    """
+    lines, blocks = deviation.shape
+    if lines < 3:
+        return np.ones((lines, blocks))
+    bent = deviation[1:-1] - 0.5 * (deviation[:-2] + deviation[2:])
+    stated = noise2[1:-1] + 0.25 * (noise2[:-2] + noise2[2:])
+    other = rest2[1:-1] + 0.25 * (rest2[:-2] + rest2[2:])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # Where other doubts rule, scatter says little about noise.
+        ratio = np.where(stated > 1.5 * other, bent * bent / stated, np.nan)
+    usable = ratio[np.isfinite(ratio)]
+    if usable.size < 100:
+        return np.ones((lines, blocks))
+    whole = float(np.median(usable))
+    tiles = np.full((-(-lines // _TILE[1]), -(-blocks // _TILE[0])), np.float32(whole))
+    for i in range(tiles.shape[0]):
+        for j in range(tiles.shape[1]):
+            # Half a tile more on every side: neighbours share what they see.
+            top, left = i * _TILE[1] - _TILE[1] // 2, j * _TILE[0] - _TILE[0] // 4
+            own = ratio[max(top, 0) : top + 2 * _TILE[1], max(left, 0) : left + (3 * _TILE[0]) // 2]
+            own = own[np.isfinite(own)]
+            if own.size:
+                share = own.size / (own.size + _SCATTER_PRIOR)
+                tiles[i, j] = share * float(np.median(own)) + (1.0 - share) * whole
+    grown = cv2.resize(tiles, (tiles.shape[1] * _TILE[0], tiles.shape[0] * _TILE[1]), interpolation=cv2.INTER_LINEAR)
+    return np.clip(grown[:lines, :blocks].astype(np.float64) / _MEDIAN_OF_SQUARE, 0.1, None)
+
+
+_AROUND = (9, 2)
+"""Blocks along and lines across of the neighbourhood whose mean may start a region: some 7 x 8 mm."""
+_GROWN = 1.5
+"""A region takes in neighbours that deviate by the precision and by this many standard uncertainties."""
+
+
+def _starts(
+    deviation: F64, doubt: Doubt, sigma: F64, precision: F64, settings: ComparisonSettings
+) -> tuple[Bool, Bool]:
+    """Cells that start a region, and cells that may belong to one."""
+    with np.errstate(invalid="ignore"):
+        size = np.abs(deviation)
+        starts = size > np.maximum(precision, settings.cell_significance * sigma)
+        member = size > np.maximum(precision, _GROWN * sigma)
+    seen = np.isfinite(deviation) & np.isfinite(sigma)
+    weight = seen.astype(np.float32)
+    total = _AROUND[0] * _AROUND[1]
+    lag = np.abs(np.subtract.outer(np.arange(_AROUND[0]), np.arange(_AROUND[0]))) * BLOCK / settings.correlation_px
+    alike = float(np.mean(np.clip(1.0 - lag, 0.0, None))) / _AROUND[1]
+    spread2 = alike * doubt.noise_mm**2 + doubt.guess_mm**2 / _AROUND[1] + doubt.common_mm**2
+    # The window of two lines reaches from a line to the next one.
+    anchor = (_AROUND[0] // 2, 0)
+    count = cv2.boxFilter(weight, -1, _AROUND, anchor=anchor, normalize=False, borderType=cv2.BORDER_CONSTANT)
+
+    def mean(values: F64) -> NDArray[np.float32]:
+        known = np.where(seen, values, 0.0).astype(np.float32)
+        summed = cv2.boxFilter(known, -1, _AROUND, anchor=anchor, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(summed / np.maximum(count, np.float32(1.0)), np.float32)
+
+    around = mean(deviation)
+    spread = np.sqrt(mean(spread2))
+    whole = count > 0.8 * total
+    level = mean(precision)
+    back = (_AROUND[0] - 1 - anchor[0], _AROUND[1] - 1 - anchor[1])
+    for sign in (1.0, -1.0):
+        found = whole & (sign * around > np.maximum(level, settings.cell_significance * spread))
+        if found.any():
+            reached = cv2.dilate(found.astype(np.uint8), np.ones((_AROUND[1], _AROUND[0]), np.uint8), anchor=back)
+            starts |= (reached > 0) & (sign * np.nan_to_num(deviation) > precision)
+            member |= starts
+    return starts & seen, member & seen
 
 
 def _regions(
-    deviates: Bool, cells: F64, sigma: F64, area: F64, x_px: F64, y_px: F64, precision: F64, floor_px: float,
-    scale: float | None, sigma_frame_mm: float, settings: ComparisonSettings,
+    deviation: F64, doubt: Doubt, sigma: F64, cells: TemplateCells, precision: F64, floor_px: float,
+    scale: float | None, settings: ComparisonSettings,
 ) -> tuple[NDArray[np.int32], tuple[Region, ...]]:  # fmt: skip
-    count, raw = cv2.connectedComponents(deviates.astype(np.uint8), connectivity=8)
-    label = np.zeros(raw.shape, np.int32)
-    if count == 1:
+    starts, member = _starts(deviation, doubt, sigma, precision, settings)
+    label = np.zeros(deviation.shape, np.int32)
+    if not starts.any():
         return label, ()
-    sizes = np.bincount(raw.ravel(), weights=np.where(deviates, area, 0.0).ravel(), minlength=count)
-    found: list[Region] = []
-    for index in np.argsort(-sizes, kind="stable"):
-        if index == 0 or sizes[index] < floor_px or sizes[index] <= 0:
+    area = cells.area_px
+    found: list[tuple[Region, Bool]] = []
+    for sign in (1.0, -1.0):
+        own = member & (sign * deviation > 0)
+        count, raw = cv2.connectedComponents(own.astype(np.uint8), connectivity=8)
+        if count == 1:
             continue
-        at = raw == index
-        weight, values = area[at], cells[at]
-        size = float(weight.sum())
-        mean = float(np.sum(np.abs(values) * weight) / size)
-        uncertainty = mean_sigma(sigma[at], weight, sigma_frame_mm, settings.correlation_px)
-        limit = float(np.sum(precision[at] * weight) / size)
-        if mean - limit < settings.region_significance * uncertainty:
-            continue
-        half = np.sqrt(weight) / 2.0
-        xs, ys = x_px[at], y_px[at]
-        left, top = float(np.min(xs - half)), float(np.min(ys - half))
-        found.append(
-            Region(
-                area_px=round(size),
-                area_mm2=size * scale**2 if scale else None,
-                volume_mm3=size * scale**2 * float(np.sum(values * weight) / size) if scale else None,
-                mean_mm=mean,
-                max_mm=float(values[np.argmax(np.abs(values))]),
-                p95_mm=float(np.percentile(np.abs(values), 95)),
-                sigma_mm=uncertainty,
-                row_px=float(np.sum(ys * weight) / size),
-                col_px=float(np.sum(xs * weight) / size),
-                box_px=(
-                    round(left),
-                    round(top),
-                    round(float(np.max(xs + half)) - left),
-                    round(float(np.max(ys + half)) - top),
-                ),
-            )
-        )
-        label[at] = len(found)
-    return label, tuple(found)
+        begun = np.bincount(raw[starts & own], minlength=count) > 0
+        sizes = np.bincount(raw.ravel(), weights=area.ravel(), minlength=count)
+        for index in range(1, count):
+            if not begun[index] or sizes[index] < floor_px or sizes[index] <= 0:
+                continue
+            at = raw == index
+            region = _region(at, deviation, doubt, cells, precision, scale, settings)
+            if region is not None:
+                found.append((region, at))
+    found.sort(key=lambda pair: -pair[0].area_px)
+    for number, (_, at) in enumerate(found, 1):
+        label[at] = number
+    return label, tuple(region for region, _ in found)
+
+
+def _region(
+    at: Bool, deviation: F64, doubt: Doubt, cells: TemplateCells, precision: F64, scale: float | None,
+    settings: ComparisonSettings,
+) -> Region | None:  # fmt: skip
+    """Figures of one region; None = it does not count."""
+    weight, values = cells.area_px[at], deviation[at]
+    size = float(weight.sum())
+    mean = float(np.sum(np.abs(values) * weight) / size)
+    uncertainty = doubt.of_mean(at, cells.area_px)
+    limit = float(np.sum(precision[at] * weight) / size)
+    if mean - limit < settings.region_significance * uncertainty or mean < settings.region_existence * uncertainty:
+        return None
+    half = np.sqrt(weight) / 2.0
+    xs, ys = cells.x_px[at], cells.y_px[at]
+    left, top = float(np.min(xs - half)), float(np.min(ys - half))
+    return Region(
+        area_px=round(size),
+        area_mm2=size * scale**2 if scale else None,
+        volume_mm3=size * scale**2 * float(np.sum(values * weight) / size) if scale else None,
+        mean_mm=mean,
+        max_mm=float(values[np.argmax(np.abs(values))]),
+        p95_mm=float(np.percentile(np.abs(values), 95)),
+        sigma_mm=uncertainty,
+        row_px=float(np.sum(ys * weight) / size),
+        col_px=float(np.sum(xs * weight) / size),
+        box_px=(
+            round(left),
+            round(top),
+            round(float(np.max(xs + half)) - left),
+            round(float(np.max(ys + half)) - top),
+        ),
+    )

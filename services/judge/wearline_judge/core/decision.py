@@ -13,7 +13,7 @@ import numpy as np
 
 from wearline.messages import Decision, ResultCode, ZoneResult
 from wearline.recipe import Limits, Recipe
-from wearline_judge.core.comparison import Comparison, mean_sigma
+from wearline_judge.core.comparison import Comparison
 from wearline_judge.core.line_grid import Bool
 
 
@@ -26,6 +26,8 @@ class Figures:
     max_error_mm: float = 0.0
     """Signed. [mm]"""
     max_sigma_mm: float = 0.0
+    profile_mm: float = 0.0
+    """Profile of the surface in the style of ISO 1101: twice the largest absolute deviation. [mm]"""
     area_mm2: float | None = 0.0
     area_px: float = 0.0
     wear_mm: float = 0.0
@@ -41,22 +43,34 @@ class Ruling:
     reason: str
 
 
-def figures(comparison: Comparison, within: Bool | None, mm_per_pixel: float | None, sigma_frame_mm: float,
-            correlation_px: float) -> Figures:  # fmt: skip
-    """Figures over the significant regions, of the whole part or the cells `within` a zone."""
+_WELL_KNOWN = 2.0
+"""The largest deviation is sought among cells whose uncertainty is at most this multiple of the usual one."""
+
+
+def figures(comparison: Comparison, within: Bool | None, mm_per_pixel: float | None) -> Figures:
+    """Figures over the significant regions, of the whole part or the cells `within` a zone.
+
+    The profile deviation looks at all compared cells; where nothing deviates, so does the largest error.
+    """
     inside = np.ones(comparison.label.shape, bool) if within is None else within
     expected, seen = float(comparison.expected[inside].sum()), float(comparison.seen[inside].sum())
     coverage = seen / expected if expected else 0.0
     at = inside & (comparison.label > 0)
-    compared = inside & np.isfinite(comparison.deviation_mm)
+    compared = inside & np.isfinite(comparison.deviation_mm) & np.isfinite(comparison.sigma_mm)
     area_unit = mm_per_pixel**2 if mm_per_pixel else None
+    highest, highest_sigma = 0.0, 0.0
+    if compared.any():
+        # One cell on a steep wall may be off by its own large uncertainty: that is no profile of the part.
+        usual = float(np.median(comparison.sigma_mm[compared]))
+        known = compared & ((comparison.sigma_mm <= _WELL_KNOWN * usual) | at)
+        values, sigmas = comparison.deviation_mm[known], comparison.sigma_mm[known]
+        peak = int(np.argmax(np.abs(values)))
+        highest, highest_sigma = float(values[peak]), float(sigmas[peak])
     if not at.any():
-        # Nothing deviates; the largest deviation is still a figure worth reading.
-        values, sigmas = comparison.deviation_mm[compared], comparison.sigma_mm[compared]
-        peak = int(np.argmax(np.abs(values))) if values.size else -1
         return Figures(
-            max_error_mm=float(values[peak]) if values.size else 0.0,
-            max_sigma_mm=float(sigmas[peak]) if values.size else 0.0,
+            max_error_mm=highest,
+            max_sigma_mm=highest_sigma,
+            profile_mm=2.0 * abs(highest),
             area_mm2=0.0 if area_unit else None,
             coverage=coverage,
         )
@@ -66,9 +80,10 @@ def figures(comparison: Comparison, within: Bool | None, mm_per_pixel: float | N
     largest = np.abs(values)[comparison.label[at] == int(np.argmax(sizes))]
     return Figures(
         mean_error_mm=float(np.sum(np.abs(values) * area) / np.sum(area)),
-        mean_sigma_mm=mean_sigma(sigmas, area, sigma_frame_mm, correlation_px),
+        mean_sigma_mm=comparison.mean_sigma(at),
         max_error_mm=float(values[peak]),
         max_sigma_mm=float(sigmas[peak]),
+        profile_mm=2.0 * abs(highest),
         area_mm2=float(area.sum()) * area_unit if area_unit else None,
         area_px=float(area.sum()),
         wear_mm=float(np.percentile(largest, 95)),
@@ -120,6 +135,7 @@ def zone_result(name: str, found: Figures, limits: Limits, recipe: Recipe) -> Zo
         max_error_mm=found.max_error_mm if is_seen else None,
         area_mm2=found.area_mm2 if is_seen else None,
         wear_mm=found.wear_mm if is_seen else None,
+        profile_mm=found.profile_mm if is_seen else None,
         coverage=found.coverage,
         is_within=is_seen and not broken and not unsure,
     )
