@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.metrology.chains import calibrated, prepared
-from wearline.artifact import Calibration, Template
+from wearline.artifact import Calibration
 from wearline.messages import LinePoints, MeasureRequest
 from wearline.recipe import Limits, Recipe, Zone
 from wearline.scene import DEFAULT_HEAD, Array, Head, Light, Plane, StampedPart, Surface, mm_per_pixel, render, trace
-from wearline.surface import dense_map
-from wearline_judge.core.golden import Golden, camera_distance_mm, make_golden
+from wearline_judge.core.golden import Golden, make_golden
 from wearline_judge.core.judgement import Judgement, JudgingSettings, Setup, judge_points, make_setup
 from wearline_judge.core.line_grid import F64, block_mean
+from wearline_judge.core.teaching import Sample, teach
 from wearline_reconstruct.core.calibration import Shot
 from wearline_reconstruct.core.chain import Prepared, Reconstruction, prepare, reconstruct
 
@@ -101,34 +101,6 @@ def line_points(found: Reconstruction) -> LinePoints:
     )  # fmt: skip
 
 
-def teach(frames: list[Reconstruction], calibration: Calibration, scale: float | None) -> Template:
-    """The template of a golden part that lay still while the frames were taken."""
-    shape = calibration.across0_px.shape
-    across, z, sigma = (np.full((len(frames), *shape), np.nan) for _ in range(3))
-    for k, found in enumerate(frames):
-        line, along = found.points[:, 0].astype(int), np.rint(found.points[:, 2 - calibration.is_vertical]).astype(int)
-        across[k, line, along] = found.points[:, 1 + calibration.is_vertical]
-        z[k, line, along], sigma[k, line, along] = found.points[:, 3], found.points[:, 4]
-    seen = np.isfinite(z).sum(axis=0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean_across, mean_z = np.nansum(across, 0) / seen, np.nansum(z, 0) / seen
-        spread = np.sqrt(np.nansum((z - mean_z) ** 2, 0) / np.maximum(seen - 1, 1))
-        mean_sigma = np.sqrt(np.nansum(sigma**2, 0)) / seen
-    line, along = np.nonzero(seen > 0)
-    row, col = (along, mean_across[line, along]) if calibration.is_vertical else (mean_across[line, along], along)
-    points = np.column_stack([line, row, col, mean_z[line, along], mean_sigma[line, along]]).astype(np.float32)
-    rows, cols = (int(v) for v in calibration.image_shape)
-    return Template(
-        line_across_px=mean_across.astype(np.float32), line_z_mm=mean_z.astype(np.float32),
-        line_sigma_mm=mean_sigma.astype(np.float32), line_spread_mm=spread.astype(np.float32),
-        line_coverage=(seen / len(frames)).astype(np.float32),
-        z_map_mm=dense_map(points, (rows, cols), is_vertical=calibration.is_vertical).z_mm,
-        roi=np.array([0, 0, cols, rows], np.int32), calibration_hash="c", recipe_hash="r", frames=len(frames),
-        meta={"is_vertical": calibration.is_vertical, "mm_per_pixel": scale,
-              "camera_distance_mm": camera_distance_mm(calibration)},
-    )  # fmt: skip
-
-
 @dataclass(frozen=True)
 class Bench:
     """A taught head: what it takes to judge parts of one object."""
@@ -157,8 +129,12 @@ def bench(head: Head = DEFAULT_HEAD, golden: Surface | None = None, frames: int 
     calibration = full_calibration(head)
     part = golden if golden is not None else StampedPart()
     free = prepared(calibration)
-    taught = [reconstruct(render(head, part, Light(), 5000 + k)[0], free) for k in range(frames)]
-    template = teach(taught, calibration, mm_per_pixel(head))
+    recipe = Recipe(mm_per_pixel=mm_per_pixel(head))
+    taught = [
+        Sample(f"golden {k}", line_points(reconstruct(render(head, part, Light(), 5000 + k)[0], free)))
+        for k in range(frames)
+    ]
+    template = teach(taught, calibration, "c", recipe, "r", JudgingSettings())
     return Bench(head, calibration, prepare(calibration, Recipe(), template), make_golden(template, None))
 
 

@@ -92,7 +92,9 @@ def test_frames_are_judged_in_the_order_given(files: Path, capsys: pytest.Captur
     assert bad["deviating_area_mm2"] == pytest.approx(168.0, rel=0.2)
     assert bad["deviating_area_px"] == pytest.approx(16800, rel=0.2)
     assert good["mean_error_mm"] == 0.0 and good["wear_mm"] == 0.0 and good["coverage"] > 0.95
-    assert set(good["registration"]) == {"dz_mm", "tilt_x_mrad", "tilt_y_mrad", "dx_mm", "dy_mm", "undetermined"}
+    assert set(good["registration"]) == {
+        "dz_mm", "tilt_x_mrad", "tilt_y_mrad", "dx_mm", "dy_mm", "turn_mrad", "undetermined", "datum",
+    }  # fmt: skip
     assert set(good["timings_ms"]) == {"decode", "reconstruct", "judge", "total"}
     assert good["timings_ms"]["total"] == pytest.approx(
         good["timings_ms"]["reconstruct"] + good["timings_ms"]["judge"], abs=0.01

@@ -23,7 +23,7 @@ from wearline.config import Settings
 from wearline.messages import Region
 from wearline.recipe import Zone
 from wearline_judge.core.golden import Golden, sample
-from wearline_judge.core.line_grid import BLOCK, BLOCK_SEEN, F64, Bool, block_mean, block_sum
+from wearline_judge.core.line_grid import BLOCK, BLOCK_SEEN, F64, Bool, LineGrid, block_mean, block_sum
 from wearline_judge.core.registration import Cells, Motion, RegistrationSettings, register
 
 
@@ -315,6 +315,28 @@ def _moved_template(
     on_line = cells.z_mm + cells.slope_x * (x - cells.x_px) + cells.slope_y * (y - cells.y_px)
     height = np.where(np.isfinite(at_map), at_map, on_line) + motion.rise(place)
     return height, np.nan_to_num(sample(golden.doubt_mm, *at))
+
+
+def point_deviation(golden: Golden, part: LineGrid, motion: Motion) -> F64:
+    """(line, along): measured minus template moved by `motion`; NaN where either has no point. [mm]"""
+    cells = template_cells(golden, None)
+    scale = golden.mm_per_pixel
+    unit = scale or 1.0
+    along = golden.along_px
+    x, y = (part.across_px, along) if golden.is_vertical else (along, part.across_px)
+    place = Cells(
+        (x - cells.middle_px[0]) * unit,
+        (y - cells.middle_px[1]) * unit,
+        golden.z_mm - cells.middle_z_mm if scale else np.zeros(part.z_mm.shape),
+        np.zeros(0),
+        np.zeros(0),
+        golden.camera_distance_mm if scale else float("inf"),
+    )
+    u, v = motion.move(place)
+    origin_x, origin_y = golden.roi[0], golden.roi[1]
+    offset = golden.z_mm - sample(golden.near_mm, golden.x_px - origin_x, golden.y_px - origin_y)
+    moved = sample(golden.near_mm, x - u / unit - origin_x, y - v / unit - origin_y)
+    return part.z_mm - (moved + np.nan_to_num(offset)) - motion.rise(place)
 
 
 _TILE = (29, 9)

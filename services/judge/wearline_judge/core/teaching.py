@@ -13,8 +13,8 @@ from wearline.errors import TemplateError
 from wearline.messages import LinePoints
 from wearline.recipe import Recipe
 from wearline.surface import dense_map
-from wearline_judge.core.comparison import Comparison, compare
-from wearline_judge.core.golden import make_golden
+from wearline_judge.core.comparison import Comparison, compare, point_deviation
+from wearline_judge.core.golden import Golden, camera_distance_mm, make_golden
 from wearline_judge.core.judgement import JudgingSettings, make_setup
 from wearline_judge.core.line_grid import F64, LineGrid, line_grid
 from wearline_judge.core.registration import out_of_pose
@@ -143,9 +143,11 @@ def teach(
     _check_seen(samples, parts, recipe)
     sigmas = np.stack([p.sigma_mm for p in parts])
     scale = calibration.mm_per_pixel if np.isfinite(calibration.mm_per_pixel) else recipe.mm_per_pixel
+    distance = camera_distance_mm(calibration)
     meta: dict[str, Any] = {
         "is_vertical": bool(calibration.is_vertical),
         "mm_per_pixel": float(scale) if scale else None,
+        "camera_distance_mm": distance if np.isfinite(distance) else None,
         "samples": [s.name for s in samples],
         "sigma_frame_mm": float(np.mean([s.points.sigma_frame_mm for s in samples])),
     }
@@ -156,31 +158,27 @@ def teach(
     mean = _meaned(parts[0].z_mm[None], sigmas[:1], calibration, is_median=False)
     for turn in range(2 if len(samples) > 1 else 0):
         template = made(mean)
-        found = [
-            _compared(template, part, recipe, settings, sample.points.sigma_frame_mm)
-            for part, sample in zip(parts, samples, strict=True)
-        ]
+        golden = make_golden(template, recipe.mm_per_pixel)
+        found = [_compared(golden, sample.points, recipe, settings) for sample in samples]
         if turn == 1:
             _check_fit(samples, found, settings, bool(scale))
-        heights = np.stack([_aligned(mean.z_mm, part, c) for part, c in zip(parts, found, strict=True)])
+        heights = np.stack([_aligned(golden, part, c) for part, c in zip(parts, found, strict=True)])
         mean = _meaned(heights, sigmas, calibration, is_median=turn == 0)
     return made(mean)
 
 
-def _compared(
-    template: Template, part: LineGrid, recipe: Recipe, settings: JudgingSettings, sigma_frame_mm: float
-) -> Comparison:
-    setup = make_setup(make_golden(template, recipe.mm_per_pixel), recipe)
+def _compared(golden: Golden, points: LinePoints, recipe: Recipe, settings: JudgingSettings) -> Comparison:
+    setup = make_setup(golden, recipe)
     return compare(
-        setup.golden, part, setup.precision_mm, recipe.area_floor_mm2, setup.datum, setup.inside, sigma_frame_mm,
-        settings.comparison, settings.registration,
+        golden, setup.cells, points.points, setup.precision_mm, recipe.area_floor_mm2, setup.datum,
+        points.sigma_frame_mm, settings.comparison, settings.registration,
     )  # fmt: skip
 
 
-def _aligned(z_mm: F64, part: LineGrid, comparison: Comparison) -> F64:
+def _aligned(golden: Golden, part: LineGrid, comparison: Comparison) -> F64:
     """Heights in the pose of the template; where it has none yet, as measured but for the motion in height."""
     away = part.z_mm - comparison.motion.dz_mm
-    return np.where(np.isfinite(z_mm), z_mm + comparison.point_deviation_mm, away)
+    return np.where(golden.is_expected, golden.z_mm + point_deviation(golden, part, comparison.motion), away)
 
 
 def _check_seen(samples: Sequence[Sample], parts: Sequence[LineGrid], recipe: Recipe) -> None:
