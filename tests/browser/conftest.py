@@ -14,11 +14,15 @@ from pathlib import Path
 
 import pytest
 import yaml
+from argon2 import PasswordHasher
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
 from tests.browser.feed import Feed
 from tests.contract.conftest import free_port, until
 from wearline.config import load_cell
+from wearline_hmi.core.rights import Role
+from wearline_hmi.drivers.accounts import Accounts
+from wearline_hmi.pages.gate import COOKIE
 from wearline_hmi.service import HISTORY_S
 
 CHROMIUM = Path("/usr/bin/chromium")
@@ -57,10 +61,33 @@ def write_cell(folder: Path, **hmi: object) -> Path:
         "cell": "press-7",
         "data_dir": "data",
         "router": {"endpoint": f"tcp/127.0.0.1:{free_port()}"},
-        "hmi": {"port": free_port(), "stale_after_s": 5.0, "records_period_s": 1.0, **hmi},
+        "hmi": {
+            "port": free_port(),
+            "stale_after_s": 5.0,
+            "records_period_s": 1.0,
+            "view_without_login": True,
+            **hmi,
+        },
     }
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
     return path
+
+
+PASSWORD = "tulip-anvil-94-fog"
+USERS = {"olga": Role.OPERATOR, "mats": Role.MAINTENANCE, "ada": Role.ADMINISTRATOR}
+
+
+def accounts_of(path: Path) -> Accounts:
+    """The users of a cell, as its hmi keeps them."""
+    return Accounts(load_cell(path).data_folder("hmi") / "accounts.db", 3600.0, 43200.0)
+
+
+def add_users(path: Path) -> None:
+    """One user of each group."""
+    accounts, secret = accounts_of(path), PasswordHasher().hash(PASSWORD)
+    for name, role in USERS.items():
+        accounts.add(name, role, secret, must_change=False)
+    accounts.close()
 
 
 def start_hmi(path: Path) -> Hmi:
@@ -79,7 +106,17 @@ def start_hmi(path: Path) -> Hmi:
 
 @pytest.fixture(scope="session")
 def cell_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_cell(tmp_path_factory.mktemp("cell"))
+    path = write_cell(tmp_path_factory.mktemp("cell"))
+    add_users(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def accounts(cell_path: Path) -> Iterator[Accounts]:
+    """The users of the running hmi, reached past it."""
+    found = accounts_of(cell_path)
+    yield found
+    found.close()
 
 
 @pytest.fixture(scope="session")
@@ -134,12 +171,17 @@ class Visit:
 
 
 @pytest.fixture
-def visit(browser: Browser, hmi: Hmi) -> Iterator[Callable[..., Visit]]:
-    """`visit(theme="dark", language="de", size=(1920, 1080))` opens a fresh browser context."""
+def visit(browser: Browser, hmi: Hmi, accounts: Accounts) -> Iterator[Callable[..., Visit]]:
+    """`visit("mats", theme="dark", language="de", size=(1920, 1080))` opens a fresh browser context; "" looks only."""
     opened: list[BrowserContext] = []
 
-    def make(theme: str = "light", language: str = "en", size: tuple[int, int] = (1280, 800)) -> Visit:
+    def make(name: str = "", theme: str = "light", language: str = "en", size: tuple[int, int] = (1280, 800)) -> Visit:
         context = browser.new_context(viewport={"width": size[0], "height": size[1]})
+        if name:
+            user = accounts.user(name)
+            assert user is not None
+            token = accounts.open_session(user, "127.0.0.1")
+            context.add_cookies([{"name": COOKIE, "value": token, "url": hmi.url}])
         context.set_default_timeout(10000)
         context.add_cookies([{"name": "wearline_look", "value": f"{theme}.{language}", "url": hmi.url}])
         opened.append(context)

@@ -75,6 +75,7 @@ class Feed:
         self._verdicts: list[m.Verdict] = []
         self._outcomes: dict[str, m.Outcome] = {}
         self._preview: m.Preview | None = None
+        self._view: m.View | None = None
         self._die_events: list[tuple[int, str]] = []
         self._lock = threading.Lock()
         self._stop = threading.Event()
@@ -107,6 +108,9 @@ class Feed:
                     self._buses[name].publish(self._state(name))
             if self._preview is not None and "capture" not in self.silent:
                 self._buses["capture"].publish(self._preview)
+            if self._view is not None and "judge" not in self.silent:
+                # The bus may drop views when it is busy; no test may depend on that.
+                self._buses["judge"].publish(self._view)
             if self._stop.wait(0.5):
                 return
 
@@ -192,12 +196,13 @@ class Feed:
             self._outcomes[verdict.cycle_id] = outcome
         if not quick:
             self.show(stroke)
-            self._buses["judge"].publish(
+            self._view = (
                 m.View(
                     cycle_id=request.cycle_id, is_simulated=self.is_simulated, maps_mm=maps, step_px=9.0,
                     origin_px=(182.0, 207.0), mm_per_pixel=0.1, stroke=stroke, decision=decision,
                 )
             )  # fmt: skip
+            self._buses["judge"].publish(self._view)
         self._buses["judge"].publish(verdict)
         self._buses["fieldbus"].publish(outcome)
         return verdict.cycle_id

@@ -47,7 +47,7 @@ def write_cell(folder: Path, base_port: int, strokes: int | None, stroke_period_
         "metrics_ports": {name: base_port + 1 + index for index, name in enumerate(SERVICES)},
         "capture": {"kind": "sim"},
         "fieldbus": {"plc": {"host": "127.0.0.1", "port": base_port + 6}},
-        "hmi": {"port": base_port + 8},
+        "hmi": {"port": base_port + 8, "view_without_login": True},
         "plc_sim": {
             "port": base_port + 6,
             "scan_ms": SCAN_MS,

@@ -141,7 +141,9 @@ def with_outcome(state: CellState, outcome: Outcome) -> CellState:
 
 
 def with_view(state: CellState, view: View, now_s: float) -> CellState:
-    """The snapshot with the newest maps."""
+    """The snapshot with the newest maps; those that are said again keep their age."""
+    if state.view is not None and state.view.cycle_id == view.cycle_id:
+        return state
     return replace(state, view=view, view_at_s=now_s, view_before=state.view)
 
 

@@ -12,11 +12,11 @@ def open_web(service: HmiService, folder: Path) -> Web:
     """Start the web server of one service; `folder` is the service's own.
 
     Raises:
-        ConfigError: the address cannot be listened on.
+        ConfigError: the address cannot be listened on, or a file of the settings cannot be read.
+        RecordError: the users cannot be read.
     """
     # NiceGUI reads this when it is imported, and would else write into the folder that the process was started in.
     os.environ["NICEGUI_STORAGE_PATH"] = str(folder / "nicegui")
-    os.environ["MATPLOTLIB"] = "false"
     from wearline_hmi.pages.web import serve
 
-    return serve(service)
+    return serve(service, folder)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from fastapi import Request
 from nicegui import ui
 from nicegui.element import Element
 
@@ -24,10 +23,9 @@ from wearline_hmi.core.words import (
     time_text,
     verdict_sign,
 )
-from wearline_hmi.pages.frame import Frame, frame
+from wearline_hmi.pages.frame import Frame
 from wearline_hmi.pages.live import LivePicture, Surface
 from wearline_hmi.pages.parts import Column, Rows, SignElement, panel, sign_cell
-from wearline_hmi.service import HmiService
 
 MAPS = ("standard", "measured", "difference", "error")
 STROKE_COLUMNS = (
@@ -41,18 +39,15 @@ STROKE_COLUMNS = (
 )
 
 
-def add_overview(service: HmiService) -> None:
-    """The page ``/``."""
-
-    @ui.page("/")
-    def overview(request: Request) -> None:
-        with frame(service, request, "/") as page, Element("div").classes("grid-overview"):
-            _verdict(page)
-            _maps(page)
-            _picture(page)
-            _strokes(page)
-            _trend(page)
-            _services(page)
+def build_overview(page: Frame) -> None:
+    """The screen ``/``."""
+    with Element("div").classes("grid-overview"):
+        _verdict(page)
+        _maps(page)
+        _picture(page)
+        _strokes(page)
+        _trend(page)
+        _services(page)
 
 
 def _verdict(page: Frame) -> None:

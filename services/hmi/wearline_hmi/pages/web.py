@@ -13,9 +13,14 @@ from fastapi import FastAPI
 from nicegui import core, run, ui
 from starlette.staticfiles import StaticFiles
 
-from wearline.errors import ConfigError
+from wearline.errors import ConfigError, WearlineError
+from wearline_hmi.core.rights import LOOK_AT_MEASURING
+from wearline_hmi.drivers.accounts import Accounts
+from wearline_hmi.drivers.hashing import Hasher
+from wearline_hmi.pages.frame import Site
+from wearline_hmi.pages.gate import Doorkeeper, Gate, add_gate
 from wearline_hmi.pages.live import add_live
-from wearline_hmi.pages.overview import add_overview
+from wearline_hmi.pages.overview import build_overview
 from wearline_hmi.pages.shield import Shield
 from wearline_hmi.service import HmiService
 
@@ -30,9 +35,11 @@ RECONNECT_S = 30.0
 class WebServer:
     """Serves until `close`; no fault of it reaches the service."""
 
-    def __init__(self, app: FastAPI, listener: socket.socket) -> None:
+    def __init__(self, app: FastAPI, listener: socket.socket, keeper: Doorkeeper) -> None:
+        settings = keeper.settings
         host, port = listener.getsockname()[:2]
-        self.address = f"http://{host}:{port}" if ":" not in host else f"http://[{host}]:{port}"
+        scheme = "http" if settings.tls_certificate is None else "https"
+        self.address = f"{scheme}://{host}:{port}" if ":" not in host else f"{scheme}://[{host}]:{port}"
         config = uvicorn.Config(
             app,
             log_config=None,
@@ -42,8 +49,12 @@ class WebServer:
             # What a browser sends over the socket is small: clicks and texts.
             ws_max_size=2**20,
             limit_concurrency=500,
+            proxy_headers=bool(settings.trusted_proxies),
+            forwarded_allow_ips=list(settings.trusted_proxies),
+            ssl_certfile=settings.tls_certificate,
+            ssl_keyfile=settings.tls_key,
         )
-        self._listener = listener
+        self._listener, self._keeper = listener, keeper
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._run, name="web", daemon=True)
         self._thread.start()
@@ -72,6 +83,8 @@ class WebServer:
             self._server.force_exit = True
             self._thread.join(STOP_S / 2)
         self._listener.close()
+        self._keeper.hasher.close()
+        self._keeper.accounts.close()
 
 
 def _listen(host: str, port: int) -> socket.socket:
@@ -89,12 +102,31 @@ def _listen(host: str, port: int) -> socket.socket:
     return listener
 
 
-def make_app(service: HmiService) -> FastAPI:
+def _forbidden(path: Path | None) -> frozenset[str]:
+    """Known passwords, in lower case.
+
+    Raises:
+        ConfigError: the file cannot be read.
+    """
+    if path is None:
+        return frozenset()
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise ConfigError(
+            f"cannot be read ({error.strerror or error})", "hmi.forbidden_passwords", "name an existing text file"
+        ) from error
+    return frozenset(line.strip().casefold() for line in text.splitlines() if line.strip())
+
+
+def make_app(service: HmiService, keeper: Doorkeeper) -> FastAPI:
     """All routes of one service; once in a process, as NiceGUI has one application."""
     app = FastAPI(title="Wearline", openapi_url=None, docs_url=None, redoc_url=None)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
+    add_gate(app, keeper, lambda: service.snapshot.cell)
     add_live(app, service)
-    add_overview(service)
+    site = Site(service, keeper)
+    site.add("/", "Overview", LOOK_AT_MEASURING, build_overview)
     run.process_pool_start_method = "spawn"
     core.sio.eio.cors_allowed_origins = []
     ui.run_with(
@@ -107,20 +139,32 @@ def make_app(service: HmiService) -> FastAPI:
         # Maps and pictures do not shrink, and packing them would hold up everybody; the network is a local one.
         gzip_middleware_factory=None,
     )
+    # The last one added is asked first.
+    app.add_middleware(Gate, keeper=keeper)
     app.add_middleware(Shield, allowed_hosts=frozenset(service.settings.allowed_hosts))
     return app
 
 
-def serve(service: HmiService) -> WebServer:
-    """Start the web server.
+def serve(service: HmiService, folder: Path) -> WebServer:
+    """Start the web server; users and sessions are kept in the folder.
 
     Raises:
-        ConfigError: the address cannot be listened on, or the server did not start.
+        ConfigError: the address cannot be listened on, a file cannot be read, or the server did not start.
+        RecordError: the users cannot be read.
     """
-    listener = _listen(service.settings.host, service.settings.port)
-    server = WebServer(make_app(service), listener)
+    settings = service.settings
+    listener = _listen(settings.host, settings.port)
+    try:
+        forbidden = _forbidden(settings.forbidden_passwords)
+        accounts = Accounts(folder / "accounts.db", 60.0 * settings.idle_minutes, 3600.0 * settings.session_hours)
+    except WearlineError:
+        listener.close()
+        raise
+    keeper = Doorkeeper(accounts, Hasher(), settings, forbidden)
+    server = WebServer(make_app(service, keeper), listener, keeper)
     if not server.wait_started(START_S):
         server.close()
         raise ConfigError("the web server did not start", "hmi", "its log says why")
     LOG.info("web interface at %s", server.address)
+    keeper.announce(server.address)
     return server
