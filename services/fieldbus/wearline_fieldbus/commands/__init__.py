@@ -1,0 +1,71 @@
+"""``wearline plc-sim``."""
+
+from __future__ import annotations
+
+import logging
+import time
+from argparse import ArgumentParser, Namespace
+from dataclasses import asdict
+from pathlib import Path
+
+from wearline.cli import Command
+from wearline.config import load_cell, validated
+from wearline.log import start_log
+from wearline.stop import StopSignal
+from wearline_fieldbus.config import PlcSimSettings
+from wearline_fieldbus.core.profiles import BASIC, Direction
+from wearline_fieldbus.core.soft_plc import SoftPlc
+from wearline_fieldbus.drivers.s7_server import S7Server
+from wearline_fieldbus.drivers.stroke_log import StrokeLog
+
+LOG = logging.getLogger(__name__)
+
+RELEASE_S = 0.5
+"""After the last stroke, for Wearline to take its result back. [s]"""
+
+
+def _configure_plc_sim(parser: ArgumentParser) -> None:
+    parser.add_argument("--config", type=Path, required=True, metavar="CELL.yaml")
+    parser.add_argument("--strokes", type=int, metavar="N", help="end after so many (default: as cell.yaml says)")
+
+
+def _run_plc_sim(arguments: Namespace) -> int:
+    cell = load_cell(arguments.config)
+    section = {**cell.plc_sim, **({} if arguments.strokes is None else {"strokes": arguments.strokes})}
+    settings = validated(PlcSimSettings, section, f"{arguments.config}: plc_sim")
+    start_log(cell.cell, "plc-sim")
+    log = StrokeLog(cell.data_folder("plc_sim") / "log.jsonl")
+    plc = SoftPlc(settings, log.stroke, log.measure_number)
+    server = S7Server(settings.host, settings.port, settings.db, BASIC.size)
+    LOG.info("soft PLC: DB%d on %s:%d, stroke %d comes next", settings.db, settings.host, server.port, plc.stroke + 1)
+    try:
+        with StopSignal() as stop:
+            _run_program(plc, server, log, settings, stop)
+    finally:
+        server.close()
+        log.close()
+    return 0
+
+
+def _run_program(plc: SoftPlc, server: S7Server, log: StrokeLog, settings: PlcSimSettings, stop: StopSignal) -> None:
+    """Scan until stopped, or until the last stroke is over and its result taken back (with a limit to the wait)."""
+    start, end = BASIC.span(Direction.REQUEST)
+    due_s = time.monotonic()
+    end_s = float("inf")
+    while due_s < end_s and not (settings.strokes is not None and log.lines >= settings.strokes and plc.is_released):
+        with server.memory() as memory:
+            belief = plc.scan(BASIC.decode(bytes(memory), Direction.RESPONSE), time.monotonic())
+            memory[start:end] = BASIC.encode(plc.request(), Direction.REQUEST)
+        if belief is not None:
+            log.add(asdict(belief))
+            if log.lines == settings.strokes:
+                end_s = due_s + RELEASE_S
+        due_s = max(due_s + settings.scan_ms / 1000.0, time.monotonic())
+        if stop.wait(max(0.0, due_s - time.monotonic())):
+            return
+
+
+PLC_SIM = Command(
+    "plc-sim", "a simulated Siemens PLC with its press line, behind the real S7 protocol", _configure_plc_sim,
+    _run_plc_sim,
+)  # fmt: skip

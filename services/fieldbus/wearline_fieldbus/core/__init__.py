@@ -1,0 +1,1 @@
+"""Pure: process image, handshake, soft PLC; time enters as an argument."""
