@@ -40,6 +40,12 @@ kills: .venv/ready-dev ## 20 kill -9 while strokes run (long)
 mutations: .venv/ready-dev ## Break the product on purpose and see a test go red; T=word picks some (long)
 	@.venv/bin/python -m tests.mutations $(T)
 
+e2e: .venv/ready-dev ## The cell of deploy/compose.yaml in containers, for real (needs Docker and `make images`)
+	@.venv/bin/python -m pytest -m slow tests/system/test_containers.py $(T)
+
+helm: .venv/ready-dev ## What helm makes of the chart (needs helm)
+	@.venv/bin/python -m pytest -m "slow or not slow" tests/unit/deploy/test_helm.py $(T)
+
 images: ## Container images of all services (needs Docker with BuildKit)
 	@deploy/images.sh
 
