@@ -17,6 +17,8 @@ _STEP_RATIO = 2.0
 """A rise this many times steeper than on both sides of it is a step, not a slope."""
 _STEP_SHARE = 0.06
 """And it is at least this share of the height that moves a line by the pitch."""
+_STEP_SHARE_AT_RIM = 0.35
+"""Where there are lines on one side only."""
 
 
 @dataclass(frozen=True)
@@ -143,6 +145,10 @@ def _steps(gap: F32, rise: F32, sigma: F32) -> NDArray[np.bool_]:
         beside = np.zeros_like(size)
         beside[1:] = np.fmax(beside[1:], np.nan_to_num(size[:-1]))
         beside[:-1] = np.fmax(beside[:-1], np.nan_to_num(size[1:]))
+        # At the rim of what is seen a wall has nothing on its other side: only a clear jump is a step there.
+        is_rim = np.ones_like(size, bool)
+        is_rim[1:-1] = ~(np.isfinite(size[:-2]) & np.isfinite(size[2:]))
+        share = np.where(is_rim, np.float32(_STEP_SHARE_AT_RIM), np.float32(_STEP_SHARE))
         # How far a line moves per mm is read from the frame: neighbours that jump also change their distance.
         usual = np.full_like(gap[:1], np.nan)
         # Beyond a region of interest there is no line at all.
@@ -151,7 +157,7 @@ def _steps(gap: F32, rise: F32, sigma: F32) -> NDArray[np.bool_]:
             usual[:, known] = np.nanmedian(gap[:, known], axis=0)
         moved = np.abs(gap - usual)
         floor = np.maximum(6.0 * np.maximum(sigma[1:], sigma[:-1]), 0.02)
-        return np.asarray((size > _STEP_RATIO * beside + floor) & (moved > _STEP_SHARE * usual))
+        return np.asarray((size > _STEP_RATIO * beside + floor) & (moved > share * usual))
 
 
 def _tangents(gap: F32, slope: F32) -> F32:
