@@ -45,6 +45,11 @@ e2e: .venv/ready-dev ## The cell of deploy/compose.yaml in containers, for real 
 
 helm: .venv/ready-dev ## What helm makes of the chart (needs helm)
 	@.venv/bin/python -m pytest -m "slow or not slow" tests/unit/deploy/test_helm.py $(T)
+records-million: .venv/ready-dev ## A million records on SQLite and PostgreSQL: insert, list and trend (long)
+	@.venv/bin/python -m pytest -s -m slow tests/unit/judge/test_records.py -k million $(T)
+
+kill-writers: .venv/ready-dev ## kill -9 while records are written, 200 times each on SQLite and PostgreSQL (long)
+	@.venv/bin/python -m pytest -m slow tests/unit/judge/test_records.py -k kills $(T)
 
 images: ## Container images of all services (needs Docker with BuildKit)
 	@deploy/images.sh
@@ -55,4 +60,4 @@ constraints: .venv/ready-dev ## Pin all third-party packages anew
 clean: ## Forget the environment and the demo's data
 	rm -rf .venv run build
 
-.PHONY: help demo test lint format bench kills mutations images constraints clean
+.PHONY: help demo test lint format bench kills records-million kill-writers mutations images constraints clean

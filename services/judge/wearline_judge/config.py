@@ -13,6 +13,8 @@ class JudgeSettings(JudgingSettings, FrameSettings):
 
     records_url: str | None = None
     """``sqlite:///FILE`` or ``postgresql://USER:PASSWORD@HOST/DATABASE``; None = SQLite in the data folder."""
+    records_kept: int | None = Field(default=None, ge=1)
+    """Records beyond this many are pruned, the oldest first; a signed checkpoint stands for them. None = keep all."""
     teach_frames: int = Field(default=5, ge=1, le=100)
     """Parts that make a template when the next ones are taught."""
     view_longest: int = Field(default=160, ge=16, le=1024)

@@ -66,10 +66,11 @@ from wearline_judge.core.teaching import Sample, teach
 from wearline_judge.core.trend import Trend, wear_limit, wear_trend
 from wearline_judge.core.view import make_view
 from wearline_judge.drivers.blobs import BlobStore
+from wearline_judge.drivers.chain import key_of
 from wearline_judge.drivers.fingerprint import code_version
 from wearline_judge.drivers.frames import Class, FrameStore
 from wearline_judge.drivers.objects import ObjectFile
-from wearline_judge.drivers.records import RecordStore, sqlite_url
+from wearline_judge.drivers.records import Cycle, RecordStore, sqlite_url
 from wearline_judge.drivers.references import AskedReferences, References, StoredReferences
 
 MEAN_ERROR = gauge("wearline_mean_error_millimeters", "Mean error of the newest measured part", ("cell", "object"))
@@ -173,6 +174,9 @@ class Judge(Service):
         """Record what could not be recorded; reconcile with the journal until fieldbus answered."""
         if self._unrecorded:
             yield from self._catch_up()
+        if self._stores is not None and not self._frames and self._settings.records_kept is not None:
+            # A little at a time: no verdict may wait for it.
+            self._stores.records.prune(self._settings.records_kept, self._utc())
         if self._journal_due_s is not None and now_s >= self._journal_due_s and not self._frames:
             yield from self._reconcile(now_s)
 
@@ -402,7 +406,7 @@ class Judge(Service):
                 records.append_outcome(outcome, self._utc())
                 return
             verdict = self._never_judged(outcome.request, outcome)
-            if records.append_cycle(verdict, outcome, self._utc(), self._clock()):
+            if records.append((Cycle(verdict, outcome, self._utc(), self._clock()),)):
                 yield self._event("warning", f"never judged: {verdict.reason}", outcome.cycle_id)
             self._note(outcome.cycle_id)
         except RecordError as error:
@@ -441,7 +445,7 @@ class Judge(Service):
                     self._stores.records.append_outcome(message, self._utc())
                 else:
                     verdict = self._never_judged(message.request, message)
-                    self._stores.records.append_cycle(verdict, message, self._utc(), self._clock())
+                    self._stores.records.append((Cycle(verdict, message, self._utc(), self._clock()),))
             except RecordError as error:
                 self._fault = str(error)
                 self._unrecorded = deque([message, *waiting])
@@ -649,6 +653,18 @@ def _unmeasured(verdict: Verdict, code: ResultCode, reason: str) -> Verdict:
     )  # fmt: skip
 
 
+def open_records(cell: CellSettings, settings: JudgeSettings, *, must_exist: bool = False) -> RecordStore:
+    """The records of a cell.
+
+    Raises:
+        ConfigError: judge.records_url is no URL.
+        RecordError: the records or the key cannot be used.
+    """
+    folder = cell.data_folder("judge")
+    url = settings.records_url or sqlite_url(folder / "records.db")
+    return RecordStore(url, key_of(folder / "chain.key"), must_exist=must_exist)
+
+
 def open_stores(cell: CellSettings, settings: JudgeSettings) -> Stores:
     """The stores of a cell.
 
@@ -660,7 +676,7 @@ def open_stores(cell: CellSettings, settings: JudgeSettings) -> Stores:
     return Stores(
         ObjectFile(folder / "objects.json"),
         BlobStore(folder),
-        RecordStore(settings.records_url or sqlite_url(folder / "records.db")),
+        open_records(cell, settings),
         FrameStore(folder / "frames", settings),
     )
 

@@ -186,7 +186,7 @@ def test_a_verdict_comes_first_with_its_references_then_the_maps(cell: Cell) -> 
 def test_the_verdict_is_on_disk_before_it_is_said(cell: Cell, tmp_path: Path) -> None:
     said = iter(cell.judge.on_line_points(line_points(Part(), 3)))
     verdict = next(said)
-    other = RecordStore(f"sqlite:///{tmp_path}/judge/records.db")
+    other = RecordStore(f"sqlite:///{tmp_path}/judge/records.db", b"k" * 32)
     assert other.verdict("c-00003") == verdict
     other.close()
 

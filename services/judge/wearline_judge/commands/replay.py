@@ -17,7 +17,7 @@ from wearline_judge.config import JudgeSettings
 from wearline_judge.drivers.blobs import BlobStore
 from wearline_judge.drivers.fingerprint import code_version
 from wearline_judge.drivers.frames import FrameStore
-from wearline_judge.drivers.records import RecordStore, sqlite_url
+from wearline_judge.service import open_records
 
 _OF_THE_FRAME = (
     ResultCode.PASSED, ResultCode.FAILED, ResultCode.UNSURE, ResultCode.COVERAGE, ResultCode.BAD_FRAME,
@@ -63,7 +63,7 @@ def _run(arguments: Namespace) -> int:
     cell = load_cell(arguments.config)
     settings = validated(JudgeSettings, cell.judge, f"{arguments.config}: judge")
     folder = cell.data_folder("judge")
-    records = RecordStore(settings.records_url or sqlite_url(folder / "records.db"))
+    records = open_records(cell, settings, must_exist=True)
     try:
         recorded = records.verdict(arguments.cycle_id)
     finally:

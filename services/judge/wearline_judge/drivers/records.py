@@ -7,25 +7,40 @@ the tally and in the wear bins are one transaction.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, Select, Table, create_engine, event, func, insert, select, text, update
+from sqlalchemy import (
+    Connection,
+    Engine,
+    Select,
+    Table,
+    create_engine,
+    delete,
+    event,
+    func,
+    insert,
+    select,
+    text,
+    update,
+)
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from wearline.errors import ConfigError, RecordError
 from wearline.messages import Decision, DieEvent, Outcome, RecordRow, Verdict
-from wearline_judge.drivers.chain import FIRST, Entry, digest
+from wearline_judge.drivers.chain import FIRST, SIGNED_EVERY, ChainError, Checkpoint, Entry, checked, digest, signature
+from wearline_judge.drivers.schema import HEAD, migrate, version_of
 from wearline_judge.drivers.tables import (
+    CHECKPOINT,
     DIE_EVENT,
     ENTRY,
     MARK,
-    METADATA,
     PART,
     RECORD,
     TALLY,
@@ -37,6 +52,12 @@ BIN = 128
 """Entries that share a wear bin: about 64 cycles of a verdict and an outcome each."""
 _WRITER_LOCK = 0x57454152
 """PostgreSQL advisory lock of whoever appends to the chain."""
+_PRUNED = "pruned"
+"""Mark: how many records were pruned."""
+_HEAD_CHECKED = 100
+"""Newest entries that are checked whenever the records are opened."""
+_AT_ONCE = 500
+"""Cycle ids in one question; databases bound the number of parameters."""
 _WAIT_S = 2.0
 """For another process that is writing; a verdict can wait no longer. [s]"""
 
@@ -85,36 +106,165 @@ def open_engine(url: str) -> Engine:
     return engine
 
 
+@dataclass(frozen=True)
+class Cycle:
+    """One cycle to be recorded: the verdict, the outcome, or both."""
+
+    verdict: Verdict | None
+    outcome: Outcome | None
+    utc: datetime
+    monotonic_s: float = 0.0
+
+    @property
+    def cycle_id(self) -> str:
+        return self.verdict.cycle_id if self.verdict is not None else self._outcome.cycle_id
+
+    @property
+    def _outcome(self) -> Outcome:
+        assert self.outcome is not None
+        return self.outcome
+
+
+class _Draft:
+    """Rows of one transaction, chained to the head of what is there."""
+
+    def __init__(self, number: int, previous: str, key: bytes) -> None:
+        self._number, self._previous, self._key = number, previous, key
+        self.rows: dict[Table, list[dict[str, Any]]] = {}
+        self.records: dict[str, dict[str, Any]] = {}
+        self.tally: dict[tuple[int, str], int] = {}
+        self.bins: dict[tuple[int, str, int, int], dict[str, Any]] = {}
+        self.told: dict[str, dict[str, Any]] = {}
+
+    def put(self, table: Table, row: dict[str, Any]) -> None:
+        self.rows.setdefault(table, []).append(row)
+
+    def entry(self, kind: str, cycle_id: str | None, utc: datetime, body: str) -> int:
+        self._number += 1
+        number, when = self._number, utc.isoformat(timespec="milliseconds")
+        name = cycle_id or f"{kind}-{number}"
+        own = digest(number, kind, name, when, body, self._previous)
+        self.put(
+            ENTRY,
+            {"number": number, "kind": kind, "cycle_id": name, "utc": when, "body": body, "previous": self._previous,
+             "digest": own},
+        )  # fmt: skip
+        if number % SIGNED_EVERY == 0:
+            self.put(CHECKPOINT, signed_row(self._key, number, own, when, is_pruned=False))
+        self._previous = own
+        return number
+
+    def verdict(self, verdict: Verdict, utc: datetime, monotonic_s: float, since: int) -> None:
+        number = self.entry("verdict", verdict.cycle_id, utc, verdict.model_dump_json())
+        record = {"number": number, "utc": utc, "monotonic_s": monotonic_s, **record_of(verdict), **_UNTOLD}
+        self.put(RECORD, record)
+        self.records[verdict.cycle_id] = record
+        index = verdict.request.object_index
+        place = (index, verdict.decision.value)
+        self.tally[place] = self.tally.get(place, 0) + 1
+        for row in zone_rows(verdict):
+            self.put(ZONE_FIGURE, {"number": number, **row})
+            if row["wear_mm"] is not None:
+                self._bin((index, row["zone"], since, number // BIN), row["wear_mm"], row["stroke"])
+
+    def _bin(self, key: tuple[int, str, int, int], wear_mm: float, stroke: int) -> None:
+        found = self.bins.get(key)
+        if found is None:
+            self.bins[key] = {
+                "count": 1, "wear_sum_mm": wear_mm, "wear_max_mm": wear_mm, "first_stroke": stroke,
+                "last_stroke": stroke,
+            }  # fmt: skip
+            return
+        found["count"] += 1
+        found["wear_sum_mm"] += wear_mm
+        found["wear_max_mm"] = max(found["wear_max_mm"], wear_mm)
+        found["last_stroke"] = stroke
+
+    def outcome(self, outcome: Outcome, utc: datetime) -> None:
+        self.entry("outcome", outcome.cycle_id, utc, outcome.model_dump_json())
+        told = told_of(outcome)
+        if outcome.cycle_id in self.records:
+            self.records[outcome.cycle_id].update(told)
+        else:
+            self.told[outcome.cycle_id] = told
+
+
 class RecordStore:
     """The chained entries and what is made from them; used by one thread."""
 
-    def __init__(self, url: str) -> None:
-        """Open, and make the tables where they are missing.
+    def __init__(self, url: str, key: bytes, *, must_exist: bool = False) -> None:
+        """Open, and make or migrate the tables.
+
+        Args:
+            url: of SQLite or PostgreSQL.
+            key: signs checkpoints (`chain.key_of`).
+            must_exist: do not make a database where there is none.
 
         Raises:
             ConfigError: no URL of SQLite or PostgreSQL.
-            RecordError: not a database, damaged, not writable, not reachable.
+            RecordError: not a database, damaged, not writable, not reachable, or of a newer version.
         """
         self._engine = open_engine(url)
         self._place = self._engine.url.render_as_string(hide_password=True)
+        self._key = key
         self._insert = sqlite.insert if self._engine.dialect.name == "sqlite" else postgresql.insert
+        self._count = self._upsert(TALLY, {"count": "sum"})
+        self._gather = self._upsert(
+            WEAR_BIN, {"count": "sum", "wear_sum_mm": "sum", "wear_max_mm": "max", "last_stroke": "new"}
+        )
+        self._keep = self._upsert(MARK, {"content": "new"})
         self._since: dict[int, int] = {}
-        with self._writing() as db:
-            METADATA.create_all(db)
-            if self._engine.dialect.name == "sqlite":
-                found = str(db.exec_driver_sql("PRAGMA quick_check(1)").scalar())
-                if found != "ok":
-                    raise self._broken(found)
+        file = self._engine.url.database
+        if must_exist and self._engine.dialect.name == "sqlite" and not Path(file or "").is_file():
+            raise self._absent()
+        try:
+            with self._reading() as db:
+                found = version_of(db)
+            if not found and must_exist:
+                raise self._absent()
+            if found != HEAD:
+                with self._writing() as db:
+                    migrate(db)
+        except ValueError as error:
+            raise self._broken(str(error)) from error
+        self._check_head()
 
     def close(self) -> None:
         """Give the connections back."""
         self._engine.dispose()
+
+    def _absent(self) -> RecordError:
+        return RecordError("holds no records", self._place, "check data_dir and judge.records_url in cell.yaml")
 
     def _broken(self, what: str) -> RecordError:
         return RecordError(
             f"the records cannot be used ({what})", self._place,
             "free space on the disk, restore a backup, or mend judge.records_url",
         )  # fmt: skip
+
+    def _upsert(self, table: Table, changes: Mapping[str, str]) -> Any:
+        """Insert a row; where its key is there already, add to, maximise or replace the columns in `changes`."""
+        made = self._insert(table)
+        greatest = func.max if self._engine.dialect.name == "sqlite" else func.greatest
+        merge: dict[str, Callable[[Any, Any], Any]] = {
+            "sum": lambda old, new: old + new, "max": greatest, "new": lambda _, new: new,
+        }  # fmt: skip
+        return made.on_conflict_do_update(
+            index_elements=[column.name for column in table.primary_key],
+            set_={name: merge[how](table.c[name], made.excluded[name]) for name, how in changes.items()},
+        )
+
+    def _check_head(self) -> None:
+        """The newest entries must fit each other: who appends to a damaged file makes it worse."""
+        asked = select(ENTRY).order_by(ENTRY.c.number.desc()).limit(_HEAD_CHECKED)
+        with self._reading() as db:
+            newest = [Entry(*row) for row in db.execute(asked)]
+        later: Entry | None = None
+        for entry in newest:
+            own = digest(entry.number, entry.kind, entry.cycle_id, entry.utc, entry.body, entry.previous)
+            if own != entry.digest or (later is not None and later.previous != own):
+                raise self._broken(f"entry {entry.number} was altered")
+            later = entry
 
     @contextmanager
     def _writing(self) -> Iterator[Connection]:
@@ -144,8 +294,7 @@ class RecordStore:
         Raises:
             RecordError: it could not be made durable (disk full, damaged file, no database).
         """
-        with self._writing() as db:
-            return self._verdict(db, verdict, utc, monotonic_s)
+        return self.append((Cycle(verdict, None, utc, monotonic_s),)) == 1
 
     def append_outcome(self, outcome: Outcome, utc: datetime) -> bool:
         """Commit what the PLC was told; False where this cycle already has an outcome.
@@ -153,19 +302,30 @@ class RecordStore:
         Raises:
             RecordError: it could not be made durable.
         """
-        with self._writing() as db:
-            return self._outcome(db, outcome, utc)
+        return self.append((Cycle(None, outcome, utc),)) == 1
 
-    def append_cycle(self, verdict: Verdict, outcome: Outcome, utc: datetime, monotonic_s: float) -> bool:
-        """Commit verdict and outcome of a cycle that was never judged, both or none; False where it has a verdict.
+    def append(self, cycles: Sequence[Cycle]) -> int:
+        """Commit cycles, all or none; entries that are there already are left out. Returns the number of new entries.
 
         Raises:
             RecordError: they could not be made durable.
         """
         with self._writing() as db:
-            is_new = self._verdict(db, verdict, utc, monotonic_s)
-            self._outcome(db, outcome, utc)
-            return is_new
+            draft = self._draft(db)
+            known = self._known(db, [cycle.cycle_id for cycle in cycles])
+            added = 0
+            for cycle in cycles:
+                if cycle.verdict is not None and ("verdict", cycle.cycle_id) not in known:
+                    since = self._since_of(db, cycle.verdict.request.object_index)
+                    draft.verdict(cycle.verdict, cycle.utc, cycle.monotonic_s, since)
+                    known.add(("verdict", cycle.cycle_id))
+                    added += 1
+                if cycle.outcome is not None and ("outcome", cycle.cycle_id) not in known:
+                    draft.outcome(cycle.outcome, cycle.utc)
+                    known.add(("outcome", cycle.cycle_id))
+                    added += 1
+            self._flush(db, draft)
+        return added
 
     def append_die_event(self, done: DieEvent, stroke: int, utc: datetime) -> None:
         """Commit one service of the die; the wear trend starts anew.
@@ -175,73 +335,75 @@ class RecordStore:
         """
         body = json.dumps({**done.model_dump(mode="json"), "stroke": stroke})
         with self._writing() as db:
-            number = self._append(db, "die_event", None, utc, body)
-            db.execute(
-                insert(DIE_EVENT),
-                {"number": number, "object_index": done.object_index, "stroke": stroke, "kind": done.kind,
-                 "note": done.note, "person": done.user},
-            )  # fmt: skip
+            draft = self._draft(db)
+            number = draft.entry("die_event", None, utc, body)
+            draft.put(DIE_EVENT, {"number": number, **die_event_of(json.loads(body))})
+            self._flush(db, draft)
         self._since[done.object_index] = number
 
-    def _append(self, db: Connection, kind: str, cycle_id: str | None, utc: datetime, body: str) -> int:
+    def prune(self, kept: int, utc: datetime, at_most: int = 500) -> int:
+        """Remove the oldest records beyond `kept`, no more than `at_most` at once; returns how many went.
+
+        A signed checkpoint stands for them. Tally, wear bins and die events stay.
+
+        Raises:
+            RecordError: it could not be made durable.
+        """
+        with self._reading() as db:
+            all_time = int(db.execute(select(func.sum(TALLY.c.count))).scalar() or 0)
+        pruned = int(self.mark(_PRUNED) or 0)
+        excess = all_time - pruned - kept
+        if excess <= 0:
+            return 0
+        with self._writing() as db:
+            oldest = select(RECORD.c.number).order_by(RECORD.c.number)
+            gone = min(excess, at_most)
+            cut = db.execute(oldest.offset(gone).limit(1)).scalar()
+            if cut is None:
+                cut = 1 + int(db.execute(select(func.max(ENTRY.c.number))).scalar() or 0)
+            last = db.execute(select(ENTRY.c.number, ENTRY.c.digest).where(ENTRY.c.number == cut - 1)).one()
+            for table in (ZONE_FIGURE, RECORD, ENTRY, CHECKPOINT):
+                db.execute(delete(table).where(table.c.number < cut))
+            when = utc.isoformat(timespec="milliseconds")
+            db.execute(insert(CHECKPOINT), signed_row(self._key, int(last[0]), str(last[1]), when, is_pruned=True))
+            self._set_mark(db, _PRUNED, str(pruned + gone))
+        return gone
+
+    def _draft(self, db: Connection) -> _Draft:
         last = db.execute(select(ENTRY.c.number, ENTRY.c.digest).order_by(ENTRY.c.number.desc()).limit(1)).first()
-        number, previous = (int(last[0]) + 1, str(last[1])) if last else (1, FIRST)
-        name, when = cycle_id or f"{kind}-{number}", utc.isoformat(timespec="milliseconds")
-        db.execute(
-            insert(ENTRY),
-            {"number": number, "kind": kind, "cycle_id": name, "utc": when, "body": body, "previous": previous,
-             "digest": digest(number, kind, name, when, body, previous)},
-        )  # fmt: skip
-        return number
+        if last is None:
+            pruned = select(CHECKPOINT.c.number, CHECKPOINT.c.digest).order_by(CHECKPOINT.c.number.desc()).limit(1)
+            last = db.execute(pruned).first()
+        return _Draft(int(last[0]), str(last[1]), self._key) if last else _Draft(0, FIRST, self._key)
+
+    def _flush(self, db: Connection, draft: _Draft) -> None:
+        for table, rows in draft.rows.items():
+            db.execute(insert(table), rows)
+        for cycle_id, told in draft.told.items():
+            db.execute(update(RECORD).where(RECORD.c.cycle_id == cycle_id).values(**told))
+        if draft.tally:
+            db.execute(
+                self._count, [{"object_index": i, "decision": d, "count": n} for (i, d), n in draft.tally.items()]
+            )
+        if draft.bins:
+            db.execute(
+                self._gather,
+                [
+                    {"object_index": index, "zone": zone, "since": since, "bin": number, **figures}
+                    for (index, zone, since, number), figures in draft.bins.items()
+                ],
+            )
 
     @staticmethod
-    def _has(db: Connection, kind: str, cycle_id: str) -> bool:
-        asked = select(ENTRY.c.number).where(ENTRY.c.kind == kind, ENTRY.c.cycle_id == cycle_id)
-        return db.execute(asked).first() is not None
-
-    def _verdict(self, db: Connection, verdict: Verdict, utc: datetime, monotonic_s: float) -> bool:
-        if self._has(db, "verdict", verdict.cycle_id):
-            return False
-        number = self._append(db, "verdict", verdict.cycle_id, utc, verdict.model_dump_json())
-        db.execute(insert(RECORD), {"number": number, "utc": utc, "monotonic_s": monotonic_s, **record_of(verdict)})
-        index = verdict.request.object_index
-        self._add(db, TALLY, {"object_index": index, "decision": verdict.decision.value}, {"count": 1}, {})
-        rows = zone_rows(verdict)
-        if rows:
-            db.execute(insert(ZONE_FIGURE), [{"number": number, **row} for row in rows])
-        since = self._since_of(db, index)
-        for row in rows:
-            if row["wear_mm"] is None:
-                continue
-            key = {"object_index": index, "zone": row["zone"], "since": since, "bin": number // BIN}
-            self._add(
-                db, WEAR_BIN, key, {"count": 1, "wear_sum_mm": row["wear_mm"]},
-                {"wear_max_mm": row["wear_mm"], "first_stroke": row["stroke"], "last_stroke": row["stroke"]},
-            )  # fmt: skip
-        return True
-
-    def _outcome(self, db: Connection, outcome: Outcome, utc: datetime) -> bool:
-        if self._has(db, "outcome", outcome.cycle_id):
-            return False
-        self._append(db, "outcome", outcome.cycle_id, utc, outcome.model_dump_json())
-        told = {"told_code": outcome.code if outcome.was_told else None, "told_utc": _instant(outcome.told_utc),
-                "cycle_seconds": outcome.cycle_seconds}  # fmt: skip
-        db.execute(update(RECORD).where(RECORD.c.cycle_id == outcome.cycle_id).values(**told))
-        return True
-
-    def _add(
-        self, db: Connection, table: Table, key: Mapping[str, Any], more: Mapping[str, Any], last: Mapping[str, Any]
-    ) -> None:
-        """Insert a row, or add `more` to the one that is there; of `last`, a maximum is kept, else the newest."""
-        made = self._insert(table).values(**key, **more, **last)
-        changes: dict[str, Any] = {name: table.c[name] + made.excluded[name] for name in more}
-        for name in last:
-            if name.endswith("max_mm"):
-                old, new = table.c[name], made.excluded[name]
-                changes[name] = func.max(old, new) if db.dialect.name == "sqlite" else func.greatest(old, new)
-            elif name != "first_stroke":
-                changes[name] = made.excluded[name]
-        db.execute(made.on_conflict_do_update(index_elements=list(key), set_=changes))
+    def _known(db: Connection, cycle_ids: Sequence[str]) -> set[tuple[str, str]]:
+        """(kind, cycle_id) of the entries that these cycles have."""
+        known: set[tuple[str, str]] = set()
+        for start in range(0, len(cycle_ids), _AT_ONCE):
+            asked = select(ENTRY.c.kind, ENTRY.c.cycle_id).where(
+                ENTRY.c.kind.in_(("verdict", "outcome")), ENTRY.c.cycle_id.in_(cycle_ids[start : start + _AT_ONCE])
+            )
+            known.update((str(kind), str(name)) for kind, name in db.execute(asked))
+        return known
 
     def _since_of(self, db: Connection, object_index: int) -> int:
         if object_index not in self._since:
@@ -254,18 +416,18 @@ class RecordStore:
     def has_verdict(self, cycle_id: str) -> bool:
         """Whether this cycle was judged."""
         with self._reading() as db:
-            return self._has(db, "verdict", cycle_id)
+            return ("verdict", cycle_id) in self._known(db, [cycle_id])
 
     def has_outcome(self, cycle_id: str) -> bool:
         """Whether it is on record what the PLC was told."""
         with self._reading() as db:
-            return self._has(db, "outcome", cycle_id)
+            return ("outcome", cycle_id) in self._known(db, [cycle_id])
 
     def rows(
         self, last: int, object_index: int | None = None, cycle_id: str = "", with_verdict: bool = False
     ) -> tuple[RecordRow, ...]:
         """The newest records, newest first."""
-        wanted = [RECORD, ENTRY.c.body] if with_verdict else [RECORD]
+        wanted = [RECORD.c[name] for name in ("number", "utc", *_ROW)] + ([ENTRY.c.body] if with_verdict else [])
         asked: Select[Any] = select(*wanted).order_by(RECORD.c.number.desc()).limit(last)
         if with_verdict:
             asked = asked.join(ENTRY, ENTRY.c.number == RECORD.c.number)
@@ -365,6 +527,78 @@ class RecordStore:
                 return
             after = found[-1].number
 
+    def verified(self) -> Iterator[Entry]:
+        """Every entry, oldest first, once it and all that was made from it was checked.
+
+        Raises:
+            ChainError: naming the first entry that was altered, removed or put in.
+        """
+        with self._reading() as db:
+            points = [Checkpoint(*row) for row in db.execute(select(CHECKPOINT).order_by(CHECKPOINT.c.number))]
+        batch: list[Entry] = []
+        try:
+            for entry in checked(self.entries(), points, self._key):
+                batch.append(entry)
+                if len(batch) == _AT_ONCE:
+                    self._check_rows(batch)
+                    yield from batch
+                    batch = []
+        except ChainError:
+            # What was made from an earlier entry comes first.
+            self._check_rows(batch)
+            raise
+        self._check_rows(batch)
+        yield from batch
+
+    def count_entries(self) -> int:
+        """How many entries there are."""
+        with self._reading() as db:
+            return int(db.execute(select(func.count()).select_from(ENTRY)).scalar() or 0)
+
+    def _check_rows(self, entries: Sequence[Entry]) -> None:
+        """The rows beside the entries must say what the entries say.
+
+        Raises:
+            ChainError: one does not.
+        """
+        if not entries:
+            return
+        within = (entries[0].number, entries[-1].number)
+        with self._reading() as db:
+            records = self._rows_between(db, RECORD, *within)
+            events = self._rows_between(db, DIE_EVENT, *within)
+            told = {
+                row["cycle_id"]: dict(row)
+                for row in db.execute(
+                    select(RECORD).where(RECORD.c.cycle_id.in_([e.cycle_id for e in entries if e.kind == "outcome"]))
+                ).mappings()
+            }
+            zones: dict[int, list[dict[str, Any]]] = {}
+            asked = select(ZONE_FIGURE).where(ZONE_FIGURE.c.number.between(*within)).order_by(ZONE_FIGURE.c.zone)
+            for row in db.execute(asked).mappings():
+                zones.setdefault(row["number"], []).append(dict(row))
+        for entry in entries:
+            found: Mapping[str, Any] | None
+            if entry.kind == "verdict":
+                verdict = Verdict.model_validate_json(entry.body)
+                found, made = records.get(entry.number), record_of(verdict)
+                figures = sorted(({"number": entry.number, **row} for row in zone_rows(verdict)), key=_zone_of)
+                if zones.get(entry.number, []) != figures:
+                    raise ChainError(f"zone figures of entry {entry.number} (cycle {entry.cycle_id}) were altered")
+            elif entry.kind == "outcome":
+                found, made = told.get(entry.cycle_id), told_of(Outcome.model_validate_json(entry.body))
+                if found is None:
+                    continue  # its verdict was pruned
+            else:
+                found, made = events.get(entry.number), die_event_of(json.loads(entry.body))
+            if found is None or any(found[name] != value for name, value in made.items()):
+                raise ChainError(f"row of entry {entry.number} ({entry.kind} of cycle {entry.cycle_id}) was altered")
+
+    @staticmethod
+    def _rows_between(db: Connection, table: Table, first: int, last: int) -> dict[int, dict[str, Any]]:
+        asked = select(table).where(table.c.number.between(first, last))
+        return {row["number"]: dict(row) for row in db.execute(asked).mappings()}
+
     def mark(self, name: str) -> str:
         """A small fact that was kept, or nothing."""
         with self._reading() as db:
@@ -377,8 +611,38 @@ class RecordStore:
             RecordError: it could not be made durable.
         """
         with self._writing() as db:
-            made = self._insert(MARK).values(name=name, content=content)
-            db.execute(made.on_conflict_do_update(index_elements=["name"], set_={"content": made.excluded.content}))
+            self._set_mark(db, name, content)
+
+    def _set_mark(self, db: Connection, name: str, content: str) -> None:
+        db.execute(self._keep, {"name": name, "content": content})
+
+
+_UNTOLD: dict[str, Any] = {"told_code": None, "told_utc": None, "cycle_seconds": None}
+
+
+def signed_row(key: bytes, number: int, entry_digest: str, utc: str, *, is_pruned: bool) -> dict[str, Any]:
+    """A row of ``checkpoint``."""
+    return {
+        "number": number, "digest": entry_digest, "utc": utc, "is_pruned": is_pruned,
+        "signature": signature(key, number, entry_digest, utc, is_pruned),
+    }  # fmt: skip
+
+
+def told_of(outcome: Outcome) -> dict[str, Any]:
+    """The columns of ``record`` that an outcome fills."""
+    return {
+        "told_code": outcome.code if outcome.was_told else None,
+        "told_utc": _instant(outcome.told_utc),
+        "cycle_seconds": outcome.cycle_seconds,
+    }
+
+
+def die_event_of(body: Mapping[str, Any]) -> dict[str, Any]:
+    """The columns of ``die_event`` that an entry fills."""
+    return {
+        "object_index": body["object_index"], "stroke": body["stroke"], "kind": body["kind"], "note": body["note"],
+        "person": body["user"],
+    }  # fmt: skip
 
 
 def record_of(verdict: Verdict) -> dict[str, Any]:
@@ -431,17 +695,24 @@ def zone_rows(verdict: Verdict) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
+_ROW = (
+    "cycle_id", "object_index", "part_id", "stroke", "measure_number", "decision", "code", "reason",
+    "mean_error_mm", "max_error_mm", "wear_mm", "told_code", "cycle_seconds", "is_simulated",
+)  # fmt: skip
+"""Columns of ``record`` that `RecordRow` has under the same name."""
+
+
 def _row(found: Mapping[str, Any]) -> RecordRow:
-    fields: Sequence[str] = (
-        "cycle_id", "object_index", "part_id", "stroke", "measure_number", "decision", "code", "reason",
-        "mean_error_mm", "max_error_mm", "wear_mm", "told_code", "cycle_seconds", "is_simulated",
-    )  # fmt: skip
     return RecordRow(
         record_id=found["number"],
         utc=found["utc"].isoformat(timespec="milliseconds"),
         verdict_json=found.get("body", ""),
-        **{name: found[name] for name in fields},
+        **{name: found[name] for name in _ROW},
     )
+
+
+def _zone_of(row: Mapping[str, Any]) -> str:
+    return str(row["zone"])
 
 
 def _instant(iso: str) -> datetime | None:

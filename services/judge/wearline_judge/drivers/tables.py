@@ -146,8 +146,9 @@ MARK = Table(
 
 CHECKPOINT = Table(
     "checkpoint", METADATA,
-    Column("number", BIG, primary_key=True, autoincrement=False, comment="last entry that was pruned"),
+    Column("number", BIG, primary_key=True, autoincrement=False, comment="an entry"),
     Column("digest", String(64), nullable=False, comment="of that entry"),
     Column("utc", String(40), nullable=False),
+    Column("is_pruned", Boolean(create_constraint=False), nullable=False, comment="the entries up to it were removed"),
     Column("signature", String(64), nullable=False, comment="HMAC-SHA256 over the other columns"),
 )  # fmt: skip

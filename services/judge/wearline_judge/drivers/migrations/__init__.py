@@ -1,0 +1,1 @@
+"""Schema of the records by version, for Alembic."""
