@@ -113,9 +113,6 @@ class Books:
 def prepared(folder: Path) -> Path:
     """A folder with what every simulated cell needs (calibration, template, released object), made once per run."""
     cell = SimulatedCell(folder)
-    import wearline.demo.cell as dc
-
-    dc.GOLDEN_PARTS = 1  # HACK
     prepare(cell.path, lambda text: None)
     return folder
 
