@@ -51,6 +51,10 @@ records-million: .venv/ready-dev ## A million records on SQLite and PostgreSQL: 
 kill-writers: .venv/ready-dev ## kill -9 while records are written, 200 times each on SQLite and PostgreSQL (long)
 	@.venv/bin/python -m pytest -m slow tests/unit/judge/test_records.py -k kills $(T)
 
+plc-faults: .venv/ready-dev ## Every network fault at every step of a PLC cycle, and 3000 random histories (long)
+	@.venv/bin/python -m pytest -m slow -s tests/faults/test_plc_faults.py $(T)
+	@WEARLINE_FAULT_EXAMPLES=3000 .venv/bin/python -m pytest tests/unit/fieldbus/test_handshake_machine.py --timeout 1800
+
 images: ## Container images of all services (needs Docker with BuildKit)
 	@deploy/images.sh
 
@@ -60,4 +64,4 @@ constraints: .venv/ready-dev ## Pin all third-party packages anew
 clean: ## Forget the environment and the demo's data
 	rm -rf .venv run build
 
-.PHONY: help demo test lint format bench kills records-million kill-writers mutations images constraints clean
+.PHONY: help demo test lint format bench kills records-million kill-writers mutations images constraints clean plc-faults

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from tests.contract.conftest import free_port, until
-from tests.unit.fieldbus.tcp_proxy import READ, WRITE, Proxy, function_of
+from tests.faults.tcp_proxy import READ, WRITE, Proxy, function_of
 from wearline.errors import DeviceError
 from wearline_fieldbus.drivers.memory import MemoryPlc
 from wearline_fieldbus.drivers.plc import (
