@@ -45,6 +45,7 @@ e2e: .venv/ready-dev ## The cell of deploy/compose.yaml in containers, for real 
 
 helm: .venv/ready-dev ## What helm makes of the chart (needs helm)
 	@.venv/bin/python -m pytest -m "slow or not slow" tests/unit/deploy/test_helm.py $(T)
+
 records-million: .venv/ready-dev ## A million records on SQLite and PostgreSQL: insert, list and trend (long)
 	@.venv/bin/python -m pytest -s -m slow tests/unit/judge/test_records.py -k million $(T)
 
