@@ -6,9 +6,10 @@ from pydantic import Field
 
 from wearline_judge.core.judgement import JudgingSettings
 from wearline_judge.drivers.frames import FrameSettings
+from wearline_judge.drivers.room import RoomSettings
 
 
-class JudgeSettings(JudgingSettings, FrameSettings):
+class JudgeSettings(JudgingSettings, FrameSettings, RoomSettings):
     """How parts are judged, and where the records lie."""
 
     records_url: str | None = None
@@ -19,5 +20,3 @@ class JudgeSettings(JudgingSettings, FrameSettings):
     """Parts that make a template when the next ones are taught."""
     view_longest: int = Field(default=160, ge=16, le=1024)
     """Elements along the longer side of the maps for the eye."""
-    reserve_mb: float = Field(default=256.0, ge=0)
-    """With less free space than this on the disk of the records nothing new is accepted. [MB]"""

@@ -72,6 +72,7 @@ from wearline_judge.drivers.frames import Class, FrameStore
 from wearline_judge.drivers.objects import ObjectFile
 from wearline_judge.drivers.records import Cycle, RecordStore, sqlite_url
 from wearline_judge.drivers.references import AskedReferences, References, StoredReferences
+from wearline_judge.drivers.room import Room
 
 MEAN_ERROR = gauge("wearline_mean_error_millimeters", "Mean error of the newest measured part", ("cell", "object"))
 WEAR = gauge("wearline_wear_millimeters", "Wear of the newest measured part", ("cell", "object", "zone"))
@@ -104,6 +105,7 @@ class Stores:
     blobs: BlobStore
     records: RecordStore
     frames: FrameStore
+    room: Room
 
 
 class Judge(Service):
@@ -187,9 +189,17 @@ class Judge(Service):
             "unrecorded": len(self._unrecorded),
             "is_reconciled": self._journal_due_s is None,
         }
-        if self._stores is not None:
-            values["frames_left_out"] = self._stores.frames.left_out
-        return Health("degraded" if self._fault else "ready", self._fault, values)
+        if self._stores is None:
+            return Health("ready", "", values)
+        has_room = self._stores.room.has_room()
+        # fieldbus withdraws Ready: nothing may be accepted that cannot be recorded.
+        values["accepts"] = has_room and not self._unrecorded
+        values["frames_left_out"] = self._stores.frames.left_out
+        if self._unrecorded:
+            return Health("degraded", self._fault, values)
+        if not has_room:
+            return Health("degraded", "no room on disk to record a cycle; free space", values)
+        return Health("ready", "", values)
 
     def close(self) -> None:
         if self._stores is not None:
@@ -329,7 +339,7 @@ class Judge(Service):
         if self._stores is None:
             return verdict
         try:
-            self._stores.records.append_verdict(verdict, self._utc(), self._clock())
+            self._append(Cycle(verdict, None, self._utc(), self._clock()))
         except RecordError as error:
             verdict = _unmeasured(verdict, ResultCode.DISK, str(error))
             self._unrecorded.append(verdict)
@@ -396,6 +406,20 @@ class Judge(Service):
 
     # --- records ---
 
+    def _append(self, cycle: Cycle) -> int:
+        """Commit; on a full disk once more with the room that the reserve held.
+
+        Raises:
+            RecordError: it could not be made durable.
+        """
+        assert self._stores is not None
+        try:
+            return self._stores.records.append((cycle,))
+        except RecordError:
+            if not self._stores.room.free_reserve():
+                raise
+            return self._stores.records.append((cycle,))
+
     def _record_outcome(self, outcome: Outcome) -> Iterator[Message]:
         assert self._stores is not None
         try:
@@ -403,10 +427,10 @@ class Judge(Service):
             if any(isinstance(m, Verdict) and m.cycle_id == outcome.cycle_id for m in self._unrecorded):
                 raise RecordError("its verdict is not on record yet", f"cycle {outcome.cycle_id}")
             if records.has_verdict(outcome.cycle_id):
-                records.append_outcome(outcome, self._utc())
+                self._append(Cycle(None, outcome, self._utc()))
                 return
             verdict = self._never_judged(outcome.request, outcome)
-            if records.append((Cycle(verdict, outcome, self._utc(), self._clock()),)):
+            if self._append(Cycle(verdict, outcome, self._utc(), self._clock())):
                 yield self._event("warning", f"never judged: {verdict.reason}", outcome.cycle_id)
             self._note(outcome.cycle_id)
         except RecordError as error:
@@ -440,12 +464,13 @@ class Judge(Service):
             message = waiting.popleft()
             try:
                 if isinstance(message, Verdict):
-                    self._stores.records.append_verdict(message, self._utc(), self._clock())
+                    self._append(Cycle(message, None, self._utc(), self._clock()))
                 elif self._stores.records.has_verdict(message.cycle_id):
-                    self._stores.records.append_outcome(message, self._utc())
+                    self._append(Cycle(None, message, self._utc()))
                 else:
-                    verdict = self._never_judged(message.request, message)
-                    self._stores.records.append((Cycle(verdict, message, self._utc(), self._clock()),))
+                    self._append(
+                        Cycle(self._never_judged(message.request, message), message, self._utc(), self._clock())
+                    )
             except RecordError as error:
                 self._fault = str(error)
                 self._unrecorded = deque([message, *waiting])
@@ -473,18 +498,13 @@ class Judge(Service):
         if self._unrecorded:
             self._journal_due_s = now_s + _JOURNAL_PAUSE_S
             return
-        self._mark_reconciled(entries)
-        self._journal_due_s = None
-
-    def _mark_reconciled(self, entries: Iterable[JournalEntry]) -> None:
-        assert self._stores is not None
-        newest = ""
-        for entry in entries:
-            if entry.outcome is None:
-                break
-            newest = entry.accepted_utc
-        if newest:
-            self._stores.records.set_mark(_RECONCILED, newest)
+        newest = _newest_ended(entries)
+        if newest <= since:
+            self._journal_due_s = None
+            return
+        # An answer is bounded: go on from its last entry, with the next tick.
+        records.set_mark(_RECONCILED, newest)
+        self._journal_due_s = now_s
 
     # --- answers ---
 
@@ -645,6 +665,16 @@ def _code_of(error: WearlineError, otherwise: ResultCode) -> ResultCode:
     return ResultCode.SERVICE_LOST if error.where.startswith("wearline/") else otherwise
 
 
+def _newest_ended(entries: Iterable[JournalEntry]) -> str:
+    """When the last entry before the first one that is still under way was accepted; empty = there is none."""
+    newest = ""
+    for entry in entries:
+        if entry.outcome is None:
+            break
+        newest = entry.accepted_utc
+    return newest
+
+
 def _unmeasured(verdict: Verdict, code: ResultCode, reason: str) -> Verdict:
     """The verdict without its figures."""
     return verdict.replace(
@@ -673,11 +703,13 @@ def open_stores(cell: CellSettings, settings: JudgeSettings) -> Stores:
         RecordError: the records cannot be used.
     """
     folder = cell.data_folder("judge")
+    room = Room(folder, settings)
     return Stores(
         ObjectFile(folder / "objects.json"),
         BlobStore(folder),
         open_records(cell, settings),
-        FrameStore(folder / "frames", settings),
+        FrameStore(folder / "frames", settings, room.is_low),
+        room,
     )
 
 

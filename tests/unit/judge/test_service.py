@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -48,7 +48,7 @@ from wearline.recipe import Limits, Recipe
 from wearline.topics import JOURNAL, Query
 from wearline_judge.config import JudgeSettings
 from wearline_judge.drivers.frames import pixel_hash
-from wearline_judge.drivers.records import RecordStore
+from wearline_judge.drivers.records import Cycle, RecordStore
 from wearline_judge.drivers.references import StoredReferences
 from wearline_judge.service import Judge, Stores, open_stores
 
@@ -63,6 +63,7 @@ class Fieldbus:
     entries: list[JournalEntry] = field(default_factory=list)
     is_there: bool = True
     asked: list[str] = field(default_factory=list)
+    most: int = 1000
 
     def ask(self, query: Query, question: Message, argument: str = "", timeout_s: float = 1.0) -> Message:
         assert query == JOURNAL
@@ -70,7 +71,7 @@ class Fieldbus:
         if not self.is_there:
             raise BusError("nobody answers", "wearline/test/fieldbus/do/journal", "is fieldbus running?")
         since = self.asked[-1]
-        return Journal(entries=tuple(e for e in self.entries if e.accepted_utc >= since))
+        return Journal(entries=tuple([e for e in self.entries if e.accepted_utc >= since][: self.most]))
 
 
 class Clock:
@@ -254,17 +255,56 @@ def test_what_cannot_be_recorded_is_not_passed_and_is_recorded_later(
         raise RecordError("the records cannot be used (database or disk is full)", "records.db", "free space")
 
     with monkeypatch.context() as broken:
-        broken.setattr(cell.stores.records, "append_verdict", full)
+        broken.setattr(cell.stores.records, "append", full)
         found = cell.judged(Part(), 1)
         assert found.decision is Decision.NOT_MEASURED and found.code == ResultCode.DISK
         assert list(cell.judge.on_outcome(outcome(1, ResultCode.DISK))) == []
-        assert cell.judge.health().status == "degraded"
+        health = cell.judge.health()
+        assert health.status == "degraded" and health.values["accepts"] is False
         assert list(cell.judge.tick(200.0)) == []
     (told,) = [m for m in cell.judge.tick(201.0) if isinstance(m, Event)]
     assert "2 entries" in told.text
     assert cell.judge.health().status == "ready"
     (row,) = cell.records().rows
     assert row.code == ResultCode.DISK and row.told_code == ResultCode.DISK
+
+
+def test_a_long_journal_is_taken_page_by_page(cell: Cell) -> None:
+    fieldbus = cell.fieldbus
+    fieldbus.most = 3
+    fieldbus.entries = [entry(stroke, outcome(stroke, ResultCode.LATE)) for stroke in range(1, 9)]
+    for turn in range(6):
+        list(cell.judge.tick(101.0 + turn))
+    assert cell.records().total == 8 and cell.judge.health().values["is_reconciled"] is True
+
+
+def test_low_disk_withdraws_readiness_and_the_reserve_carries_what_is_under_way(
+    make: Callable[..., Cell], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = make(settings=JudgeSettings(min_free_mb=1.0, reserve_mb=0.5))
+    reserve = cell.folder / "judge" / "reserve"
+    assert cell.judge.health().values["accepts"] is True and reserve.stat().st_size == 500_000
+    free = {"bytes": 900_000}
+    monkeypatch.setattr(cell.stores.room, "_free", lambda _: free["bytes"])
+    health = cell.judge.health()
+    assert health.status == "degraded" and health.values["accepts"] is False and "free space" in health.detail
+    append = cell.stores.records.append
+
+    def full_while_reserved(cycles: Sequence[Cycle]) -> int:
+        if reserve.exists():
+            raise RecordError("the records cannot be used (database or disk is full)", "records.db", "free space")
+        return append(cycles)
+
+    monkeypatch.setattr(cell.stores.records, "append", full_while_reserved)
+    assert cell.judged(Part(), 1).decision is Decision.PASSED
+    list(cell.judge.on_outcome(outcome(1)))
+    assert cell.records().rows[0].told_code == 1 and not reserve.exists()
+    assert cell.judge.health().values["accepts"] is False
+    # Room for records alone is not enough: the reserve must be whole again.
+    free["bytes"] = 1_400_000
+    assert cell.judge.health().values["accepts"] is False
+    free["bytes"] = 2_000_000
+    assert cell.judge.health().values["accepts"] is True and reserve.stat().st_size == 500_000
 
 
 def test_the_outcome_completes_the_record(cell: Cell) -> None:
@@ -307,6 +347,8 @@ def test_the_start_reconciles_with_the_journal_until_fieldbus_answers(cell: Cell
     assert len(fieldbus.asked) == 1
     fieldbus.is_there = True
     list(cell.judge.tick(103.0))
+    assert cell.judge.health().values["is_reconciled"] is False  # an answer is bounded: there may be more
+    list(cell.judge.tick(103.5))
     assert cell.judge.health().values["is_reconciled"] is True
     rows = {row.cycle_id: row for row in cell.records().rows}
     assert set(rows) == {"c-00001", "c-00002", "c-00003"}
@@ -315,7 +357,7 @@ def test_the_start_reconciles_with_the_journal_until_fieldbus_answers(cell: Cell
     # The PLC was told Passed, but no verdict is on record: the record must not claim one.
     assert rows["c-00003"].decision is Decision.NOT_MEASURED and rows["c-00003"].code == ResultCode.INTERRUPTED
     list(cell.judge.tick(110.0))
-    assert len(fieldbus.asked) == 2
+    assert len(fieldbus.asked) == 3
     # Cycle 4 was under way; what fieldbus says of it when it comes back is recorded, the others not twice.
     fieldbus.entries[3] = entry(4, outcome(4, ResultCode.INTERRUPTED))
     cell.judge.on_alive("fieldbus", False)

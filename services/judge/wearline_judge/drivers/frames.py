@@ -8,6 +8,7 @@ import os
 import queue
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -56,8 +57,9 @@ class _Job:
 class FrameStore:
     """Writes on a thread of its own, so that no verdict waits for it; what cannot keep up is counted and left out."""
 
-    def __init__(self, folder: Path, settings: FrameSettings) -> None:
-        self._folder, self._quota_bytes = folder, int(settings.frames_quota_mb * 1e6)
+    def __init__(self, folder: Path, settings: FrameSettings, is_low: Callable[[], bool] = lambda: False) -> None:
+        """`is_low` says whether the disk is so full that frames must give way to records."""
+        self._folder, self._quota_bytes, self._is_low = folder, int(settings.frames_quota_mb * 1e6), is_low
         self._kept: dict[Class, OrderedDict[str, int]] = {kind: OrderedDict() for kind in Class}
         self.left_out = 0
         """Frames that were not stored: the disk was full, failed or too slow."""
@@ -119,6 +121,10 @@ class FrameStore:
             self._kept[kind].update((name, size) for _, name, size in sorted(found))
 
     def _store(self, job: _Job) -> None:
+        if self._is_low():
+            self.left_out += 1
+            self._give_way()
+            return
         name = pixel_hash(job.pixels)
         # A frame that was seen before keeps the better of its two places.
         if any(name in self._kept[kind] for kind in Class if list(Class).index(kind) >= list(Class).index(job.kind)):
@@ -133,6 +139,13 @@ class FrameStore:
         draft.write_bytes(content.tobytes())
         draft.replace(path)
         self._kept[job.kind][name] = content.size
+
+    def _give_way(self) -> None:
+        """Remove the oldest frames of good parts until the disk has room, or none is left."""
+        kept = self._kept[Class.PASSED]
+        while kept and self._is_low():
+            name, _ = kept.popitem(last=False)
+            self._path(name, Class.PASSED).unlink(missing_ok=True)
 
     def _make_room(self, size: int) -> None:
         used = sum(sum(kept.values()) for kept in self._kept.values())
