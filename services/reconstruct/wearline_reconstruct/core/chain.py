@@ -208,7 +208,7 @@ def reconstruct(pixels: Image, prepared: Prepared, clock_s: Callable[[], float] 
     lap("lines")
     number, spot = _numbered(strip, found, prepared)
     lap("numbering")
-    result = _measured(found, number, spot is not None, prepared)
+    result = _measured(found, number, spot, prepared)
     lap("heights")
     return Reconstruction(
         result.points,
@@ -341,7 +341,7 @@ class _Measured:
     quality: FrameQuality
 
 
-def _measured(found: Fragments, number: I64, spot_found: bool, prepared: Prepared) -> _Measured:
+def _measured(found: Fragments, number: I64, spot: Spot | None, prepared: Prepared) -> _Measured:
     calibration, recipe = prepared.calibration, prepared.recipe
     lines, along_size = calibration.across0_px.shape
     keep = _one_each(number, found, (lines, along_size))
@@ -362,7 +362,7 @@ def _measured(found: Fragments, number: I64, spot_found: bool, prepared: Prepare
     if recipe.method == "thesis":
         z, posterior, is_rejected = _filtered_by_thesis(found, places, prepared)
     else:
-        z, posterior, is_rejected = _smoothed(found, places, prepared)
+        z, posterior, is_rejected = _smoothed(found, places, spot, prepared)
     vibration = float(calibration.meta.get("vibration_px", 0.05)) * float(np.median(slope[::19])) if len(slope) else 0.0
     common = float(np.hypot(vibration, float(calibration.meta.get("z_sigma_common_mm", 0.0))))
     sigma = np.sqrt(posterior**2 + calibration.z_sigma_mm[line, along] ** 2 + vibration**2)
@@ -385,7 +385,7 @@ def _measured(found: Fragments, number: I64, spot_found: bool, prepared: Prepare
         )  # fmt: skip
     seen = int(np.count_nonzero(np.bincount(line[order])))
     wanted = int((expected.sum(axis=1) > 0.1 * along_size).sum())
-    quality = describe(found, seen, max(wanted, seen), spot_found, calibration.stripe_width_px, coverage)
+    quality = describe(found, seen, max(wanted, seen), spot is not None, calibration.stripe_width_px, coverage)
     return _Measured(points, common, coverage, quality)
 
 
@@ -401,7 +401,9 @@ class _Places:
     slope_mm_per_px: F64
 
 
-def _smoothed(found: Fragments, places: _Places, prepared: Prepared) -> tuple[F64, F64, Bool]:
+def _smoothed(
+    found: Fragments, places: _Places, spot: Spot | None, prepared: Prepared
+) -> tuple[F64, F64, Bool]:
     """Smoothed heights [mm], their standard uncertainty without what is common to the frame [mm], and outliers."""
     calibration, line, along = prepared.calibration, places.line, places.along
     slope, z = places.slope_mm_per_px, places.z_mm
@@ -413,12 +415,16 @@ def _smoothed(found: Fragments, places: _Places, prepared: Prepared) -> tuple[F6
     grid_z[line, along] = z
     length = max(found.correlation_px, 1.0)
     streak = float(calibration.meta.get("streak_px", _STREAK_PX))
-    grid_sigma[line, along] = slope * np.sqrt(fast**2 * length + texture**2 * streak)
+    spread = _spot_px(found, places, spot, prepared)
+    grid_sigma[line, along] = slope * np.sqrt(fast**2 * length + texture**2 * streak + spread**2 * _SPOT_LENGTH_PX)
     label[line, along] = found.label[places.keep]
-    point = slope * np.sqrt(fast**2 + texture**2)
+    point = slope * np.sqrt(fast**2 + texture**2 + spread**2)
     steep = float(np.median(slope[::19])) ** 2
+    # The spot's own error must not pass for a bend.
+    calm_z = grid_z.copy()
+    calm_z[line[spread > 0.0], along[spread > 0.0]] = np.nan
     process = _process_noise(
-        grid_z, steep * float(np.median(fast[::19])) ** 2, length, steep * float(np.median(texture[::19])) ** 2,
+        calm_z, steep * float(np.median(fast[::19])) ** 2, length, steep * float(np.median(texture[::19])) ** 2,
         streak, prepared.settings.smoothing.reach_px,
     )  # fmt: skip
     starts = _piece_starts(label, grid_z)
@@ -459,6 +465,38 @@ def _texture_px(found: Fragments, keep: I64, prepared: Prepared) -> F64:
     steady = np.sqrt(max(base**2 - ambient_then**2, 0.0))
     signal = np.maximum(found.peaks.signal_dn[keep].astype(np.float64), 1.0)
     return np.asarray(np.hypot(steady, gain * found.peaks.noise_dn / signal))
+
+
+_SPOT_REACH = 0.75
+"""Half the length along the middle line on which the spot's light may lie. [pitch]"""
+_SPOT_SHARE = 0.6
+_SPOT_LENGTH_PX = 10.0
+"""Along the line the spot's own speckle is alike over some of its width. [px]"""
+
+
+def _spot_px(found: Fragments, places: _Places, spot: Spot | None, prepared: Prepared) -> F64:
+    """Error of each position by the light of the centre spot, 0 away from it. [px]
+
+    The spot is a disc many stripes wide, and its middle need not lie on its line: it pulls the centre by a
+    share of what it adds to the stripe's width.
+    """
+    spread = np.zeros(len(places.keep))
+    if spot is None:
+        return spread
+    pitch, peaks = prepared.scale.pitch_px, found.peaks
+    near = np.flatnonzero(
+        (np.abs(places.along - spot.along_px) < _SPOT_REACH * pitch)
+        & (np.abs(peaks.across_px[places.keep] - spot.across_px) < 0.5 * pitch)
+    )
+    if len(near) < 3:
+        return spread
+    width = peaks.width_px[places.keep[near]].astype(np.float64)
+    size = min(9, len(near))
+    padded = np.pad(width, size // 2, mode="edge")
+    usual = np.convolve(padded, np.full(size, 1.0 / size), mode="valid")[: len(near)]
+    line_width = float(np.median(peaks.width_px[::7]))
+    spread[near] = _SPOT_SHARE * np.sqrt(np.maximum(usual**2 - line_width**2, 0.0))
+    return spread
 
 
 def _piece_starts(label: I64, z: F64) -> Bool:
