@@ -180,9 +180,13 @@ class _Demo:
             yield update
 
     def _print_new_rows(self) -> None:
-        for row in self._picture.rows[self._printed :]:
+        rows = self._picture.rows
+        # The outcome may be heard before the verdict that it rests on; its line waits for that.
+        if rows and not rows[-1].is_whole and not self._supervisor.is_done(PLC_SIM):
+            rows = rows[:-1]
+        for row in rows[self._printed :]:
             self._say(screen.line(row))
-        self._printed = len(self._picture.rows)
+        self._printed = max(self._printed, len(rows))
 
     def _look(self) -> None:
         now_s = time.monotonic()

@@ -30,6 +30,11 @@ class Row:
     told_code: int | None = None
     """None until the PLC was told, or when it was too late to tell."""
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether all that there is to hear of it was heard."""
+        return self.mean_mm is not None or self.decision is Decision.NOT_MEASURED
+
 
 @dataclass(frozen=True)
 class Believed:

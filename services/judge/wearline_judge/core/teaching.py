@@ -111,6 +111,12 @@ def clipped(recipe: Recipe, rows: int, cols: int) -> tuple[int, int, int, int]:
     return left, top, right - left, bottom - top
 
 
+_SUSPICION = 6.5
+"""Standard uncertainties by which a region of a golden frame must stand out to be suspicious. More than a part
+is failed for: streaks of the sheet reach five on one good frame of fifty, and the frame need not be good to a limit
+but alike the others."""
+
+
 def teach(
     samples: Sequence[Sample],
     calibration: Calibration,
@@ -169,9 +175,10 @@ def teach(
 
 def _compared(golden: Golden, points: LinePoints, recipe: Recipe, settings: JudgingSettings) -> Comparison:
     setup = make_setup(golden, recipe)
+    comparison = settings.comparison.model_copy(update={"region_existence": _SUSPICION})
     return compare(
         golden, setup.cells, points.points, setup.precision_mm, recipe.area_floor_mm2, setup.datum,
-        points.sigma_frame_mm, settings.comparison, settings.registration,
+        points.sigma_frame_mm, comparison, settings.registration,
     )  # fmt: skip
 
 

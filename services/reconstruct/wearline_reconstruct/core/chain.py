@@ -401,9 +401,7 @@ class _Places:
     slope_mm_per_px: F64
 
 
-def _smoothed(
-    found: Fragments, places: _Places, spot: Spot | None, prepared: Prepared
-) -> tuple[F64, F64, Bool]:
+def _smoothed(found: Fragments, places: _Places, spot: Spot | None, prepared: Prepared) -> tuple[F64, F64, Bool]:
     """Smoothed heights [mm], their standard uncertainty without what is common to the frame [mm], and outliers."""
     calibration, line, along = prepared.calibration, places.line, places.along
     slope, z = places.slope_mm_per_px, places.z_mm
