@@ -137,6 +137,8 @@ def test_a_second_demo_in_the_same_folder_is_refused_in_one_sentence(
 
 def test_a_taken_port_is_named_with_its_cure(first_run: tuple[int, str], folder: Path, base_port: int) -> None:
     with socket.socket() as taken:
+        # Connections of the runs before may linger there.
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         taken.bind(("127.0.0.1", base_port))
         taken.listen()
         process = demo(folder, base_port, "--strokes", "1")
