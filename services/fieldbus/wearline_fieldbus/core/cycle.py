@@ -27,7 +27,7 @@ class HandshakeSettings(Settings):
     """After the Measure edge: then NOT_MEASURED is written. [s]"""
     silent_after_s: float = Field(default=3.0, gt=0)
     """After the Measure edge: from then on nothing is written for that cycle. [s]"""
-    io_timeout_s: float = Field(default=0.4, gt=0, le=0.5)
+    io_timeout_s: float = Field(default=0.3, gt=0, le=0.5)
     """No exchange with the PLC takes longer; an exchange that does is given up with its connection. [s]"""
     result_hold_s: float = Field(default=0.5, ge=0)
     """A result stands at least so long where Measure fell before it came. [s]"""

@@ -108,7 +108,6 @@ TABLE: tuple[Row, ...] = (
     Row((_S.MEASURING,), Image, ("response_is_disturbed",), "abandon_and_clear", _S.CLEARING),
     # Clear, then Ready.
     Row((_S.CLEARING,), Written, ("write_is_the_last",), "show_idle", _S.IDLE),
-    Row((_S.CLEARING,), Skipped, ("write_is_the_last",), "clear", _S.CLEARING),
     # Measure.
     Row((_S.IDLE,), Image, ("measure_rises", "ready_was_shown", "is_ready", "number_is_new"), "accept", _S.MEASURING),
     Row((_S.CLEARING, _S.IDLE), Image, ("measure_rises",), "refuse_measure"),
@@ -139,13 +138,9 @@ TABLE: tuple[Row, ...] = (
     Row(tuple(State), ModeWanted, (), "refuse_busy"),
     Row(_FREE, ObjectWanted, ("is_manual", "no_manual_cycle"), "select_object"),
     Row(tuple(State), ObjectWanted, (), "refuse_object"),
-    # Whatever else happens may change Ready.
+    # What is left.
     Row(tuple(State), VerdictCame, (), "ignore_verdict"),
-    Row((_S.IDLE,), Image, (), "show_idle"),
     Row((_S.IDLE,), Tick, (), "show_idle"),
-    Row((_S.IDLE,), ServiceChanged, (), "show_idle"),
-    Row((_S.IDLE,), RoomChanged, (), "show_idle"),
-    Row((_S.IDLE,), ObjectChecked, (), "show_idle"),
 )
 
 READY: Mapping[str, str] = {
@@ -288,7 +283,7 @@ class Handshake:
             if all(self._guard(name) for name in row.guards):
                 # An effect sees the state that it ends in.
                 self.state = row.target or self.state
-                EFFECTS[row.effect](self)
+                getattr(self, row.effect)()
                 break
         self._rises = False
         if isinstance(event, Tick):
@@ -778,7 +773,3 @@ def _was_ready(machine: Handshake) -> bool:
     ready = machine._profile.field("ready")
     assert ready is not None and ready.bit is not None and machine._acknowledged is not None
     return bool(machine._acknowledged[ready.byte - start] >> ready.bit & 1)
-
-
-EFFECTS: Mapping[str, Callable[[Handshake], None]] = {row.effect: getattr(Handshake, row.effect) for row in TABLE}
-"""Every effect by its name."""
