@@ -314,6 +314,8 @@ class Preview(Message):
     jpeg: Annotated[NDArray[np.uint8], ArraySpec("uint8", ("byte",))]
     frame_counter: int
     is_simulated: bool
+    step_px: float = 1.0
+    """Sensor pixels for each pixel of the picture. [px]"""
 
 
 class ServiceState(Message):
@@ -402,6 +404,14 @@ class AskRecords(Ask):
     object_index: int | None = None
     cycle_id: str = ""
     with_verdict: bool = False
+    decisions: tuple[Decision, ...] = ()
+    """Only these; empty = all."""
+    search: str = Field(default="", max_length=100)
+    """Only parts whose id contains this, or whose stroke it is."""
+    before: int | None = None
+    """Only records with a smaller `record_id`: the next page."""
+    with_trends: bool = True
+    """False spares judge the fit where only rows are wanted."""
 
 
 class RecordRow(Message):

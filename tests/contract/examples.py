@@ -80,7 +80,7 @@ EXAMPLES: tuple[m.Message, ...] = (
         step_px=4.0, origin_px=(0.0, 2.0),
     ),
     OUTCOME,
-    m.Preview(jpeg=np.frombuffer(b"\xff\xd8", np.uint8), frame_counter=3, is_simulated=True),
+    m.Preview(jpeg=np.frombuffer(b"\xff\xd8", np.uint8), frame_counter=3, is_simulated=True, step_px=2.0),
     m.ServiceState(
         service="capture", status="ready", pid=1, uptime_s=2.5, version="0",
         values={"a": 1, "b": 0.5, "c": None, "d": True}
@@ -92,7 +92,9 @@ EXAMPLES: tuple[m.Message, ...] = (
         object_index=3, object_name="bracket", recipe_yaml="{}", recipe_hash="r", calibration_hash="c",
         template_hash="t", version=2,
     ),
-    ENTRY, m.ObjectList(objects=(ENTRY,)), m.AskRecords(last=5), ROW, TREND,
+    ENTRY, m.ObjectList(objects=(ENTRY,)),
+    m.AskRecords(last=5, decisions=(m.Decision.FAILED,), search="A4", before=9),
+    ROW, TREND,
     m.Records(rows=(ROW,), total=1, trends=(TREND,)), m.Do(), m.DoMeasure(user="ada"), m.SelectObject(object_index=3),
     m.SetMode(mode="auto"), m.AskJournal(),
     m.JournalEntry(request=REQUEST, is_simulated=True, accepted_utc="2026-01-01T00:00:00+00:00", outcome=OUTCOME),

@@ -83,7 +83,12 @@ class Capture(Service):
         """The last frame as a preview; encoded once, said again for those who come later."""
         if self._shown is not None:
             jpeg = encoded_preview(self._shown, self._settings.preview_step, self._settings.preview_quality)
-            self._preview = Preview(jpeg=jpeg, frame_counter=self._counter, is_simulated=self._camera.is_simulated)
+            self._preview = Preview(
+                jpeg=jpeg,
+                frame_counter=self._counter,
+                is_simulated=self._camera.is_simulated,
+                step_px=self._settings.preview_step,
+            )
             self._shown = None
         if self._preview is not None:
             yield self._preview

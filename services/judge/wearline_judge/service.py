@@ -524,9 +524,9 @@ class Judge(Service):
         counts = records.counts(asked.object_index)
         wanted = records.objects() if asked.object_index is None else (asked.object_index,)
         return Records(
-            rows=records.rows(asked.last, asked.object_index, asked.cycle_id, asked.with_verdict),
+            rows=records.rows(asked),
             total=sum(counts.values()),
-            trends=tuple(self._trend(index) for index in wanted),
+            trends=tuple(self._trend(index) for index in wanted) if asked.with_trends else (),
             passed=counts.get(Decision.PASSED, 0),
             failed=counts.get(Decision.FAILED, 0) + counts.get(Decision.UNSURE, 0),
             not_measured=counts.get(Decision.NOT_MEASURED, 0),

@@ -159,6 +159,7 @@ def test_preview_is_a_small_jpeg_of_the_last_frame() -> None:
     (first,) = service.tick(1.0)
     (again,) = service.tick(2.0)
     assert isinstance(first, Preview) and again is first
+    assert first.step_px == 2.0
     picture = cv2.imdecode(np.array(first.jpeg), cv2.IMREAD_UNCHANGED)
     assert picture is not None and picture.shape == (20, 30) and abs(float(picture.mean()) - 7.0) < 2.0
     with pytest.raises(ValueError, match="pixels"):

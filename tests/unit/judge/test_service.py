@@ -380,6 +380,25 @@ def test_records_are_newest_first_with_counts_and_verdicts(cell: Cell) -> None:
     assert cell.judge.on_records(AskRecords(object_index=9)).total == 0
 
 
+def test_records_are_found_by_part_stroke_and_decision_page_by_page(cell: Cell) -> None:
+    for stroke in (1, 2, 12):
+        cell.judged(Part(flaw_mm=0.3 if stroke == 2 else 0.0), stroke)
+    answer = cell.judge.on_records
+
+    def strokes(**wanted: Any) -> list[int]:
+        return [row.stroke for row in answer(AskRecords(**wanted)).rows]
+
+    assert strokes(search="2") == [12, 2]
+    assert strokes(search="p12") == [12]
+    assert strokes(search="%") == strokes(search="_") == strokes(search="99999999999999999999") == []
+    assert strokes(decisions=(Decision.FAILED,)) == [2]
+    assert strokes(decisions=(Decision.FAILED, Decision.PASSED)) == [12, 2, 1]
+    first = answer(AskRecords(last=2)).rows
+    assert [row.stroke for row in first] == [12, 2]
+    assert strokes(last=2, before=first[-1].record_id) == [1]
+    assert answer(AskRecords(with_trends=False)).trends == ()
+
+
 def test_wear_rises_towards_the_limit_and_a_die_event_starts_anew(make: Callable[..., Cell]) -> None:
     cell = make(recipe=Recipe(limits=Limits(max_error_mm=0.5)))
     for stroke in range(1, 25):

@@ -33,7 +33,7 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from wearline.errors import ConfigError, RecordError
-from wearline.messages import Decision, DieEvent, Outcome, RecordRow, Verdict
+from wearline.messages import AskRecords, Decision, DieEvent, Outcome, RecordRow, Verdict
 from wearline_judge.drivers.chain import FIRST, SIGNED_EVERY, ChainError, Checkpoint, Entry, checked, digest, signature
 from wearline_judge.drivers.schema import HEAD, migrate, version_of
 from wearline_judge.drivers.tables import (
@@ -423,18 +423,25 @@ class RecordStore:
         with self._reading() as db:
             return ("outcome", cycle_id) in self._known(db, [cycle_id])
 
-    def rows(
-        self, last: int, object_index: int | None = None, cycle_id: str = "", with_verdict: bool = False
-    ) -> tuple[RecordRow, ...]:
-        """The newest records, newest first."""
-        wanted = [RECORD.c[name] for name in ("number", "utc", *_ROW)] + ([ENTRY.c.body] if with_verdict else [])
-        asked: Select[Any] = select(*wanted).order_by(RECORD.c.number.desc()).limit(last)
-        if with_verdict:
+    def rows(self, wanted: AskRecords) -> tuple[RecordRow, ...]:
+        """The records that are asked for, newest first."""
+        columns = [RECORD.c[name] for name in ("number", "utc", *_ROW)] + ([ENTRY.c.body] if wanted.with_verdict else [])
+        asked: Select[Any] = select(*columns).order_by(RECORD.c.number.desc()).limit(wanted.last)
+        if wanted.with_verdict:
             asked = asked.join(ENTRY, ENTRY.c.number == RECORD.c.number)
-        if object_index is not None:
-            asked = asked.where(RECORD.c.object_index == object_index)
-        if cycle_id:
-            asked = asked.where(RECORD.c.cycle_id == cycle_id)
+        if wanted.object_index is not None:
+            asked = asked.where(RECORD.c.object_index == wanted.object_index)
+        if wanted.cycle_id:
+            asked = asked.where(RECORD.c.cycle_id == wanted.cycle_id)
+        if wanted.decisions:
+            asked = asked.where(RECORD.c.decision.in_([decision.value for decision in wanted.decisions]))
+        if wanted.search:
+            found = RECORD.c.part_id.icontains(wanted.search, autoescape=True)
+            # Ten digits and more are no stroke that a press has counted.
+            is_stroke = wanted.search.isascii() and wanted.search.isdigit() and len(wanted.search) < 10
+            asked = asked.where(found | (RECORD.c.stroke == int(wanted.search)) if is_stroke else found)
+        if wanted.before is not None:
+            asked = asked.where(RECORD.c.number < wanted.before)
         with self._reading() as db:
             return tuple(_row(dict(found)) for found in db.execute(asked).mappings())
 
