@@ -20,12 +20,20 @@ from wearline import messages as m
 from wearline import topics
 from wearline.bus import Bus, open_router
 from wearline.config import CellSettings, load_cell
+from wearline.recipe import Recipe, dump_recipe
 from wearline.scene import StampedPart, part_of_stroke
 
 PUBLISHERS = ("capture", "reconstruct", "judge", "fieldbus")
 MAP_ROWS, MAP_COLS, STEP_MM = 90, 140, 0.9
 START_UTC = datetime(2026, 3, 2, 6, 0, 0, tzinfo=UTC)
 LIMIT_MM = 0.1
+OBJECTS = tuple(
+    m.ObjectEntry(
+        object_index=index, object_name=name, recipe_hash="e" * 64, calibration_hash="c" * 64, template_hash="d" * 64,
+        version=2,
+    )
+    for index, name in ((1, "tray"), (2, "bracket"))
+)  # fmt: skip
 
 
 def heights_mm(part: StampedPart) -> NDArray[np.float64]:
@@ -66,6 +74,7 @@ class Feed:
         self.cell = cell
         self.mode, self.object_index, self.is_link_up, self.is_ready = "auto", 1, True, True
         self.is_simulated = True
+        self.exposure_us, self.gain_db = 10000.0, 0.0
         self.asked: list[m.Message] = []
         """Every question and command that was answered."""
         self.silent: set[str] = set()
@@ -120,11 +129,16 @@ class Feed:
             values = {
                 "mode": self.mode,
                 "plc_link_up": self.is_link_up,
-                "is_ready": self.is_ready,
+                "ready": self.is_ready,
                 "object_index": self.object_index,
             }
         elif name == "capture":
-            values = {"camera": "sim", "exposure_us": 10000.0, "gain_db": 0.0, "frames": len(self._verdicts)}
+            values = {
+                "camera": "sim",
+                "exposure_us": self.exposure_us,
+                "gain_db": self.gain_db,
+                "frames": len(self._verdicts),
+            }
         return m.ServiceState(
             service=name, status="ready", pid=1, uptime_s=time.monotonic() - self._started_s, version="0", values=values
         )
@@ -211,6 +225,53 @@ class Feed:
 
     def _answers(self) -> None:
         self._answer("judge", topics.RECORDS, self._records)
+        self._answer("judge", topics.RECIPE_LIST, lambda _: m.ObjectList(objects=OBJECTS))
+        self._answer("judge", topics.RECIPE, self._recipe)
+        self._answer("judge", topics.TEACH, lambda _: m.Done(ok=True, text="object 1: version 3, taught from 3 parts"))
+        self._answer("judge", topics.DIE_EVENT, self._on_die_event)
+        self._answer("fieldbus", topics.MODE, self._on_mode)
+        self._answer("fieldbus", topics.SELECT_OBJECT, self._on_select)
+        self._answer("fieldbus", topics.DO_MEASURE, self._on_measure)
+        self._answer("capture", topics.SET_CAMERA, self._on_set_camera)
+
+    def _recipe(self, question: m.Message) -> m.ObjectRecipe:
+        assert isinstance(question, m.AskRecipe)
+        entry = next(entry for entry in OBJECTS if entry.object_index == question.object_index)
+        return m.ObjectRecipe(**entry.model_dump(), recipe_yaml=dump_recipe(Recipe(roi=(180, 200, 1280, 820))))
+
+    def _on_die_event(self, wanted: m.Message) -> m.Done:
+        assert isinstance(wanted, m.DieEvent)
+        with self._lock:
+            stroke = self._verdicts[-1].request.stroke if self._verdicts else 0
+            self._die_events.append((stroke, f"{wanted.kind}: {wanted.note}" if wanted.note else wanted.kind))
+        return m.Done(ok=True, text=f"{wanted.kind} of object {wanted.object_index} recorded at stroke {stroke}")
+
+    def _on_mode(self, wanted: m.Message) -> m.Done:
+        assert isinstance(wanted, m.SetMode)
+        self.mode = wanted.mode
+        return m.Done(ok=True, text=f"mode {wanted.mode}")
+
+    def _on_select(self, wanted: m.Message) -> m.Done:
+        assert isinstance(wanted, m.SelectObject)
+        if self.mode != "manual":
+            return m.Done(ok=False, text="the PLC selects the object in automatic mode")
+        self.object_index = wanted.object_index
+        return m.Done(ok=True, text=f"object {wanted.object_index}")
+
+    def _on_measure(self, wanted: m.Message) -> m.Done:
+        if self.mode != "manual":
+            return m.Done(ok=False, text="the PLC measures in automatic mode")
+        return m.Done(ok=True, text="measuring")
+
+    def _on_set_camera(self, wanted: m.Message) -> m.Done:
+        assert isinstance(wanted, m.SetCamera)
+        if wanted.exposure_us is not None:
+            if wanted.exposure_us > 50000:
+                return m.Done(ok=False, text="exposure_us is 60000, at most 50000")
+            self.exposure_us = wanted.exposure_us
+        if wanted.gain_db is not None:
+            self.gain_db = wanted.gain_db
+        return m.Done(ok=True, text=f"exposure {self.exposure_us:g} us, gain {self.gain_db:g} dB")
 
     def _answer(self, service: str, query: topics.Query, fn: Callable[[m.Message], m.Message]) -> None:
         def answer(question: m.Message) -> m.Message:

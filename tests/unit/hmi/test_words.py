@@ -48,7 +48,7 @@ def test_a_service_that_was_never_heard_is_grey_and_one_that_went_is_red() -> No
         optional={
             "mode": st.sampled_from(["auto", "manual", "strange", "", None]),
             "plc_link_up": st.sampled_from([True, False, None]),
-            "is_ready": st.sampled_from([True, False, None]),
+            "ready": st.sampled_from([True, False, None]),
         },
     ),
     age_s=st.floats(0, 100),
@@ -61,7 +61,7 @@ def test_the_header_is_green_only_for_what_fieldbus_says_now(
     state = s.with_alive(state, "fieldbus", is_alive)
     words = w.header_words(state, 10.0 + age_s)
     is_known = is_alive and age_s <= w.STATE_LOST_S
-    assert (words.ready.colour == "green") == (is_known and values.get("is_ready") is True)
+    assert (words.ready.colour == "green") == (is_known and values.get("ready") is True)
     assert (words.plc.colour == "green") == (is_known and values.get("plc_link_up") is True)
     assert (words.mode.colour == "green") == (is_known and values.get("mode") == "auto")
     if not is_known:

@@ -173,7 +173,7 @@ def header_words(state: CellState, now_s: float) -> HeaderWords:
         "manual": Sign("amber", "hand", "manual"),
     }.get(mode, UNKNOWN)
     return HeaderWords(
-        _flag(told.values.get("is_ready"), Sign("green", "check", "Ready"), Sign("amber", "clock", "not ready")),
+        _flag(told.values.get("ready"), Sign("green", "check", "Ready"), Sign("amber", "clock", "not ready")),
         mode_sign,
         _flag(told.values.get("plc_link_up"), Sign("green", "check", "up"), Sign("red", "cross", "DOWN")),
         object_text,

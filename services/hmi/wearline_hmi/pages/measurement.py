@@ -28,7 +28,7 @@ def build_measurement(page: Frame) -> None:
             _control(page)
             last_part(page, "fit")
             _counts(page)
-        with Element("div").classes("area-below pair"):
+        with Element("div").classes("area-below"):
             _regions(page)
             _zones(page)
 

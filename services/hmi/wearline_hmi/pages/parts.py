@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -118,3 +119,158 @@ class Rows(Element, component="rows.js"):
 def sign_cell(sign: Sign, say: Language) -> dict[str, str]:
     """A sign as a cell of `Rows`."""
     return {"colour": sign.colour, "icon": sign.icon, "word": say(sign.word), "title": sign.detail}
+
+
+def set_text(element: Element, text: str) -> None:
+    """Change a plain element's text, if it differs."""
+    if element._text != text:
+        element._text = text
+        element.update()
+
+
+def text_element(tag: str, text: str, classes: str = "") -> Element:
+    """A plain element with a text."""
+    element = Element(tag).classes(classes)
+    element._text = text
+    return element
+
+
+class Button(Element):
+    """A plain button."""
+
+    def __init__(self, text: str, on_click: Callable[..., Any] | None = None, classes: str = "") -> None:
+        super().__init__("button")
+        self._props["type"] = "button"
+        self.classes(classes)
+        self._text = text
+        if on_click is not None:
+            self.on("click", on_click)
+
+    def enable(self, is_enabled: bool, why_not: str = "") -> None:
+        """Whether it can be pressed, and why not."""
+        if self._props.get("disabled", False) is is_enabled or self._props.get("title", "") != why_not:
+            self._props["disabled"] = not is_enabled
+            self._props["title"] = why_not
+            self.update()
+
+    def press(self, is_pressed: bool) -> None:
+        """Show it as one of several that is chosen."""
+        wanted = str(is_pressed).lower()
+        if self._props.get("aria-pressed") != wanted:
+            self._props["aria-pressed"] = wanted
+            self.update()
+
+
+class Choice:
+    """A row of buttons of which one is chosen."""
+
+    def __init__(
+        self, label: str, options: Sequence[tuple[str, str]], chosen: str, on_choose: Callable[[str], Any], data: str
+    ) -> None:
+        self._on_choose = on_choose
+        self.chosen = chosen
+        self.buttons: dict[str, Button] = {}
+        with Element("div").classes("choice").props('role="group"') as group:
+            group._props["aria-label"] = label
+            for key, text in options:
+                self.buttons[key] = button = Button(text, lambda key=key: self.choose(key))
+                button._props[f"data-{data}"] = key
+                button.press(key == chosen)
+
+    def choose(self, key: str) -> Any:
+        """Choose one and say so."""
+        self.show(key)
+        return self._on_choose(key)
+
+    def show(self, key: str) -> None:
+        """Choose one in silence."""
+        self.chosen = key
+        for name, button in self.buttons.items():
+            button.press(name == key)
+
+
+_numbers = itertools.count(1)
+
+
+class Field(Element):
+    """A labelled input; `value` follows what is typed."""
+
+    def __init__(self, label: str, value: str = "", kind: str = "text", on_change: Callable[..., Any] | None = None,
+                 complete: str = "off", **props: Any) -> None:  # fmt: skip
+        super().__init__("div")
+        self.classes("field")
+        self.value = value
+        name = f"field-{next(_numbers)}"
+        with self:
+            text_element("label", label)._props["for"] = name
+            self.box = Element("input")
+            self.box._props.update(
+                {"id": name, "type": kind, "value": value, "autocomplete": complete, "maxlength": 300, **props}
+            )
+            self.box.on("input", self._take, js_handler="(event) => emit(event.target.value)")
+            if on_change is not None:
+                self.box.on("change", on_change)
+
+    def _take(self, event: Any) -> None:
+        self.value = str(event.args)
+
+    def set(self, value: str) -> None:
+        """Write something into it."""
+        self.value = value
+        self.box._props["value"] = value
+        self.box.run_method("setAttribute", "value", value)
+        self.box.update()
+
+
+class Select(Element):
+    """A labelled choice from a list; `value` is the key of what is chosen."""
+
+    def __init__(
+        self,
+        label: str,
+        options: Sequence[tuple[str, str]],
+        value: str = "",
+        on_change: Callable[..., Any] | None = None,
+    ) -> None:
+        super().__init__("div")
+        self.classes("field")
+        self._on_change = on_change
+        self.value = value
+        self._options: list[tuple[str, str]] = []
+        name = f"field-{next(_numbers)}"
+        with self:
+            text_element("label", label)._props["for"] = name
+            self.box = Element("select")
+            self.box._props["id"] = name
+            self.box.on("change", self._take, js_handler="(event) => emit(event.target.value)")
+        self.show(options, value)
+
+    def _take(self, event: Any) -> Any:
+        self.value = str(event.args)
+        return None if self._on_change is None else self._on_change(self.value)
+
+    def show(self, options: Sequence[tuple[str, str]], value: str) -> None:
+        """Other options, or another one chosen."""
+        if list(options) != self._options or value != self.box._props.get("value"):
+            self._options, self.value = list(options), value
+            self.box.clear()
+            with self.box:
+                for key, text in options:
+                    option = text_element("option", text)
+                    option._props["value"] = key
+                    option._props["selected"] = key == value
+            self.box._props["value"] = value
+            self.box.update()
+
+
+async def confirmed(say: Language, question: str, yes: str) -> bool:
+    """Whether a person says yes."""
+    with ui.dialog() as dialog, Element("div").classes("panel dialog"):
+        text_element("p", question)
+        with Element("div").classes("buttons"):
+            Button(say("Cancel"), lambda: dialog.submit(False))
+            Button(yes, lambda: dialog.submit(True), "main")
+    try:
+        return await dialog is True
+    finally:
+        dialog.delete()

@@ -14,12 +14,13 @@ from nicegui import core, run, ui
 from starlette.staticfiles import StaticFiles
 
 from wearline.errors import ConfigError, WearlineError
-from wearline_hmi.core.rights import LOOK_AT_MEASURING
+from wearline_hmi.core import rights
 from wearline_hmi.drivers.accounts import Accounts
 from wearline_hmi.drivers.hashing import Hasher
 from wearline_hmi.pages.frame import Site
 from wearline_hmi.pages.gate import Doorkeeper, Gate, add_gate
 from wearline_hmi.pages.live import add_live
+from wearline_hmi.pages.measurement import build_measurement
 from wearline_hmi.pages.overview import build_overview
 from wearline_hmi.pages.shield import Shield
 from wearline_hmi.service import HmiService
@@ -126,7 +127,8 @@ def make_app(service: HmiService, keeper: Doorkeeper) -> FastAPI:
     add_gate(app, keeper, lambda: service.snapshot.cell)
     add_live(app, service)
     site = Site(service, keeper)
-    site.add("/", "Overview", LOOK_AT_MEASURING, build_overview)
+    site.add("/", "Overview", rights.LOOK_AT_MEASURING, build_overview)
+    site.add("/measurement", "Measurement", rights.LOOK_AT_MEASURING, build_measurement)
     run.process_pool_start_method = "spawn"
     core.sio.eio.cors_allowed_origins = []
     ui.run_with(
