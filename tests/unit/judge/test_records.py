@@ -19,7 +19,7 @@ from sqlalchemy import inspect, text
 from tests.unit.judge.parts import request
 from wearline.cli import main
 from wearline.errors import ConfigError, RecordError
-from wearline.messages import Decision, DieEvent, Outcome, Verdict, ZoneResult
+from wearline.messages import AskRecords, Decision, DieEvent, Outcome, Verdict, ZoneResult
 from wearline_judge.drivers.chain import SIGNED_EVERY, ChainError, key_of
 from wearline_judge.drivers.records import Cycle, RecordStore, open_engine
 from wearline_judge.drivers.schema import HEAD, migrate, version_of
@@ -80,7 +80,7 @@ def test_a_cycle_is_recorded_once_with_all_that_is_known(database: Database) -> 
     assert not store.append_verdict(verdict(2, Decision.FAILED), utc(9), 0.0)
     assert not store.append_outcome(outcome(2), utc(9))
     assert store.append(cycles(range(2, 5))) == 2
-    rows = store.rows(10)
+    rows = store.rows(AskRecords(last=10))
     assert [row.stroke for row in rows] == [4, 3, 2, 1]
     assert rows[-1].utc == "2026-01-01T00:00:01.000+00:00" and rows[-1].part_id == "P1"
     assert rows[-1].told_code == 1 and rows[-1].cycle_seconds == 0.2 and rows[-1].wear_mm == 0.01
@@ -185,7 +185,7 @@ def test_pruned_records_leave_a_signed_checkpoint(database: Database) -> None:
     url = database("pruned")
     store = filled(url, 10)
     assert store.prune(4, utc(99), at_most=5) == 5 and store.prune(4, utc(99)) == 1 and store.prune(4, utc(99)) == 0
-    assert [row.stroke for row in store.rows(99)] == [10, 9, 8, 7]
+    assert [row.stroke for row in store.rows(AskRecords(last=99))] == [10, 9, 8, 7]
     assert [e.number for e in store.verified()] == list(range(13, 21))
     assert store.counts() == {Decision.PASSED: 10} and store.wear_bins(1)[0][2] == 10
     assert store.prune(0, utc(99)) == 4 and list(store.verified()) == []
@@ -371,7 +371,7 @@ def speed(url: str, records: int, inserts: int, clock: Callable[[], float] = tim
     found = {
         "insert_median": taken[len(taken) // 2],
         "insert_p99": taken[int(0.99 * len(taken))],
-        "list_1000": timed(lambda: store.rows(1000), 9, clock)[4],
+        "list_1000": timed(lambda: store.rows(AskRecords(last=1000)), 9, clock)[4],
         "trend": timed(trend, 9, clock)[4],
         "open": timed(lambda: RecordStore(url, KEY).close(), 3, clock)[1],
     }

@@ -425,7 +425,9 @@ class RecordStore:
 
     def rows(self, wanted: AskRecords) -> tuple[RecordRow, ...]:
         """The records that are asked for, newest first."""
-        columns = [RECORD.c[name] for name in ("number", "utc", *_ROW)] + ([ENTRY.c.body] if wanted.with_verdict else [])
+        columns = [RECORD.c[name] for name in ("number", "utc", *_ROW)] + (
+            [ENTRY.c.body] if wanted.with_verdict else []
+        )
         asked: Select[Any] = select(*columns).order_by(RECORD.c.number.desc()).limit(wanted.last)
         if wanted.with_verdict:
             asked = asked.join(ENTRY, ENTRY.c.number == RECORD.c.number)
