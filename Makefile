@@ -34,6 +34,10 @@ format: .venv/ready-dev ## Let ruff format the tree
 bench: .venv/ready-run ## Speed and precision against known truth
 	@.venv/bin/wearline bench
 
+.PHONY: wear-forecast
+wear-forecast: .venv/ready-dev ## Forecasts on 1000 simulated dies beside a straight line and an EWMA rule
+	@.venv/bin/python -m tests.metrology.wear_series $(N)
+
 kills: .venv/ready-dev ## 20 kill -9 while strokes run (long)
 	@.venv/bin/python -m pytest -m slow tests/faults $(T)
 
