@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wearline.artifact import Calibration, Template, content_hash
-from wearline.errors import BusError, FrameError, UsageError
+from wearline.errors import BusError, CalibrationError, FrameError, UsageError
 from wearline.messages import (
     Artifact,
     AskArtifact,
@@ -70,7 +70,7 @@ class Chain:
         object_name: str = "part",
         is_simulated: bool = False,
     ) -> None:
-        self.recipe = recipe or Recipe()
+        self.recipe = oriented(recipe or Recipe(), calibration)
         self._artifacts: dict[str, bytes] = {}
         self._is_simulated = is_simulated
         self._object = ObjectRecipe(
@@ -180,6 +180,19 @@ class Chain:
         for service in self._services.values():
             service.close()
         self._services.clear()
+
+
+def oriented(recipe: Recipe, calibration: Calibration | bytes | None) -> Recipe:
+    """A recipe that names no orientation takes that of its calibration."""
+    if calibration is None or "orientation" in recipe.model_fields_set:
+        return recipe
+    if isinstance(calibration, bytes):
+        try:
+            calibration = Calibration.from_bytes(calibration, "calibration")
+        except CalibrationError:
+            # The services say so, with the code that belongs to it.
+            return recipe
+    return recipe.model_copy(update={"orientation": "vertical" if calibration.is_vertical else "horizontal"})
 
 
 def _only(kind: type[M], messages: Iterable[Message], who: str) -> M:

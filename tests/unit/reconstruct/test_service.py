@@ -228,6 +228,22 @@ def test_reconstruct_writes_what_is_promised(folder: Path, tmp_path: Path, capsy
         assert float(np.nanmedian(found["z_map_mm"])) == pytest.approx(2.0, abs=0.02)
 
 
+def test_a_vertical_head_needs_no_recipe(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    upright = replace(COMB, is_vertical=True)
+    planes = []
+    for k, z in enumerate((0.0, 3.0, 6.0)):
+        cv2.imwrite(str(tmp_path / f"V{k}.png"), draw(upright, plate(z), 94 + k)[0])
+        planes.append(f"--plane={z:g}={tmp_path / f'V{k}.png'}")
+    out = ["--out", str(tmp_path / "V.npz")]
+    assert main(["calibrate", *planes, "--lines", "11", "--orientation", "vertical", *out]) == 0
+    assert main(["reconstruct", str(folder / "upright.png"), "--calibration", *out[1:], "--out", str(tmp_path)]) == 0
+    assert capsys.readouterr().err == ""
+    with np.load(tmp_path / "upright.npz") as found:
+        assert float(np.median(found["z_mm"])) == pytest.approx(2.0, abs=0.02)
+        assert np.array_equal(found["row_px"], np.rint(found["row_px"]))
+        assert found["z_map_mm"].shape == (640, 480)
+
+
 def test_stripes_only_takes_any_picture(folder: Path, tmp_path: Path) -> None:
     names = ["part.png", "colour.png", "deep.png"]
     assert main(["reconstruct", *[str(folder / n) for n in names], "--stripes-only", "--out", str(tmp_path)]) == 0

@@ -18,7 +18,7 @@ from wearline.artifact import Calibration, Template, content_hash
 from wearline.cli import Command, progress
 from wearline.errors import CalibrationError, FrameError, RecipeError, TemplateError, UsageError, WearlineError
 from wearline.messages import ResultCode, Verdict
-from wearline.offline import Chain, read_frame
+from wearline.offline import Chain, oriented, read_frame
 from wearline.recipe import Recipe, load_recipe, recipe_hash
 from wearline_judge.config import JudgeSettings
 from wearline_judge.core.golden import make_golden
@@ -55,6 +55,7 @@ def load_references(calibration: Path | None, template: Path | None, recipe: Pat
     ruling = load_recipe(recipe)
     content = _bytes(calibration, CalibrationError, "calibrate")
     found = Calibration.from_bytes(content, str(calibration))
+    ruling = oriented(ruling, found)
     if found.is_vertical != (ruling.orientation == "vertical"):
         lines = "vertical" if found.is_vertical else "horizontal"
         raise CalibrationError(f"is for {lines} lines", str(calibration), f"set orientation: {lines} in the recipe")
