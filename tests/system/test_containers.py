@@ -41,6 +41,7 @@ class Running:
     def __init__(self) -> None:
         self.project = f"wearline-e2e-{secrets.token_hex(3)}"
         self.hmi, self.prometheus = free_port(), free_port()
+        self._containers: dict[str, str] = {}
         self._environment = {
             **os.environ,
             "WEARLINE_HMI": f"127.0.0.1:{self.hmi}",
@@ -57,7 +58,10 @@ class Running:
         return done.stdout
 
     def container(self, service: str) -> str:
-        return self.compose("ps", "-q", service).strip()
+        """The container's id, which outlives a restart."""
+        if service not in self._containers:
+            self._containers[service] = self.compose("ps", "-q", service).strip()
+        return self._containers[service]
 
     def inspected(self, service: str) -> dict[str, Any]:
         (found,) = json.loads(docker("inspect", self.container(service)))
