@@ -67,12 +67,12 @@ class Entry:
     """The cell was told the outcome; what is still missing was lost with an earlier run."""
 
     def as_message(self) -> JournalEntry:
-        """For who reconciles."""
+        """For who reconciles: an outcome that the PLC may not have been told yet is none."""
         return JournalEntry(
             request=self.request,
             is_simulated=self.request.is_simulated if self.outcome is None else self.outcome.is_simulated,
             accepted_utc=self.accepted_utc,
-            outcome=self.outcome,
+            outcome=self.outcome if self.is_ended else None,
         )
 
 
