@@ -26,7 +26,7 @@ from wearline.config import CellSettings
 from wearline.demo import screen
 from wearline.demo.cell import LIMIT_MM, OBJECT_INDEX, SCAN_MS, json_lines, last_stroke, prepare, regrind, write_cell
 from wearline.demo.tally import Believed, Row, Summary, Tally, Truth, summarise
-from wearline.errors import BusError, ConfigError, UsageError
+from wearline.errors import BusError, ConfigError, DeviceError, UsageError
 from wearline.messages import AskRecords, DieEvent, Outcome, Records, ServiceState, Verdict
 from wearline.stop import StopSignal
 from wearline.supervisor import PLC_SIM, Supervisor
@@ -38,6 +38,8 @@ TREND_S = 2.0
 """Between two looks at the trend. [s]"""
 REGRIND_STROKES = 130
 """An endless demo grinds its die after so many strokes; by then it has failed parts for a good while."""
+STUCK_S = 60.0
+"""A counted run that sees no stroke for so long, and for many stroke periods, will see none. [s]"""
 LAST_S = 3.0
 """What the PLC has heard, its outcome message and record may need to arrive at the end. [s]"""
 
@@ -104,7 +106,9 @@ class _Demo:
         self._heard_s: dict[str, float] = {}
         self._is_plc_linked = False
         self._picture = screen.Picture(self._address(), limit_mm=LIMIT_MM, wanted=strokes)
-        self._printed = 0
+        self._printed = self._moved_rows = 0
+        self._moved_s = 0.0
+        self._stuck_s = max(STUCK_S, 10.0 * float(self._cell.plc_sim["stroke_period_s"]))
         self._trend_at_s = 0.0
         self._die_event: DieEvent | None = None
 
@@ -114,7 +118,7 @@ class _Demo:
     def run(self) -> int:
         self._regrind()
         first_stroke = last_stroke(self._cell) + 1
-        started_s = time.monotonic()
+        started_s = self._moved_s = time.monotonic()
         with StopSignal() as stop, self._supervisor:
             self._say(f"cell '{self._cell.cell}' starts; HMI: {self._picture.address}")
             self._bus.open(timeout_s=20.0)
@@ -125,6 +129,7 @@ class _Demo:
                         self._supervisor.step()
                         self._look()
                         update()
+                        self._check_moving()
                     is_done = self._supervisor.is_done(PLC_SIM)
                     if is_done:
                         self._wait_for_the_last(stop)
@@ -234,6 +239,17 @@ class _Demo:
             return
         if isinstance(answer, Records) and answer.trends:
             self._picture = replace(self._picture, trend=answer.trends[0])
+
+    def _check_moving(self) -> None:
+        """A script that waits for the end of a counted run must not wait for ever."""
+        if len(self._picture.rows) != self._moved_rows:
+            self._moved_rows, self._moved_s = len(self._picture.rows), time.monotonic()
+        if self._strokes is not None and time.monotonic() - self._moved_s > self._stuck_s:
+            raise DeviceError(
+                f"no stroke for {self._stuck_s:.0f} s",
+                "demo",
+                f"look into {self._cell.data_dir / 'log'} for the reason",
+            )
 
     # --- how it ended ---
 
