@@ -33,6 +33,8 @@ class Mutation:
 
 
 RECONSTRUCT = "services/reconstruct/wearline_reconstruct"
+JUDGE = "services/judge/wearline_judge"
+FIELDBUS = "services/fieldbus/wearline_fieldbus"
 
 MUTATIONS: tuple[Mutation, ...] = (
     Mutation(
@@ -63,6 +65,41 @@ MUTATIONS: tuple[Mutation, ...] = (
         "if value.dtype != np.dtype(self.dtype):",
         "if False:",
         ("tests/contract",),
+    ),
+    Mutation(
+        "fieldbus believes a verdict with another measure number",
+        f"{FIELDBUS}/core/handshake.py",
+        "lambda m: _of_cycle(m, lambda told, mine: told.measure_number == mine.measure_number)",
+        "lambda m: True",
+        ("tests/unit/fieldbus",),
+    ),
+    Mutation(
+        "the PLC believes a result that echoes another measure number",
+        f"{FIELDBUS}/core/soft_plc.py",
+        'not self._settings.numbered or response["echo"] == self.measure_number',
+        "True",
+        ("tests/unit/fieldbus",),
+    ),
+    Mutation(
+        "a request is published before it is in the journal",
+        f"{FIELDBUS}/core/handshake.py",
+        "self._out += [RecordAccepted(self.cycle), PublishRequest(self.cycle.request)]",
+        "self._out += [PublishRequest(self.cycle.request), RecordAccepted(self.cycle)]",
+        ("tests/unit/fieldbus",),
+    ),
+    Mutation(
+        "a verdict is published before its record is written",
+        f"{JUDGE}/service.py",
+        "        verdict = self._recorded(verdict)\n        self._note(verdict.cycle_id)\n        yield verdict\n",
+        "        yield verdict\n        verdict = self._recorded(verdict)\n        self._note(verdict.cycle_id)\n",
+        ("tests/unit/judge/test_service.py",),
+    ),
+    Mutation(
+        "a simulated verdict is accepted from a real cell",
+        f"{JUDGE}/service.py",
+        "if points.is_simulated and not self._accepts_simulated:",
+        "if False:",
+        ("tests/unit/judge/test_service.py",),
     ),
 )
 
