@@ -69,6 +69,7 @@ from wearline_judge.drivers.blobs import BlobStore
 from wearline_judge.drivers.chain import key_of
 from wearline_judge.drivers.fingerprint import code_version
 from wearline_judge.drivers.frames import Class, FrameStore
+from wearline_judge.drivers.lock import FolderLock
 from wearline_judge.drivers.objects import ObjectFile
 from wearline_judge.drivers.records import Cycle, RecordStore, sqlite_url
 from wearline_judge.drivers.references import AskedReferences, References, StoredReferences
@@ -123,11 +124,12 @@ class Judge(Service):
         *,
         accepts_simulated: bool = True,
         version: str = "",
+        lock: FolderLock | None = None,
         clock: Callable[[], float] = time.monotonic,
         utc: Callable[[], datetime] = lambda: datetime.now(UTC),
     ) -> None:
         self._cell, self._settings, self._references, self._stores = cell, settings, references, stores
-        self._accepts_simulated, self._version = accepts_simulated, version
+        self._accepts_simulated, self._version, self._lock = accepts_simulated, version, lock
         self._clock, self._utc = clock, utc
         self._asker: Asker | None = None
         self._setups: OrderedDict[tuple[str, str], Setup] = OrderedDict()
@@ -205,6 +207,8 @@ class Judge(Service):
         if self._stores is not None:
             self._stores.frames.close()
             self._stores.records.close()
+        if self._lock is not None:
+            self._lock.close()
 
     # --- the cycle ---
 
@@ -721,10 +725,11 @@ def build(cell: CellSettings, settings: JudgeSettings) -> Service:
         RecordError: the records cannot be used.
     """
     cv2.setNumThreads(1)  # a pool of threads would take the processors from the other services
+    lock = FolderLock(cell.data_folder("judge"))
     stores = open_stores(cell, settings)
     return Judge(
         cell.cell, settings, StoredReferences(stores.objects, stores.blobs), stores,
-        accepts_simulated=cell.plc_is_simulated, version=code_version(),
+        accepts_simulated=cell.plc_is_simulated, version=code_version(), lock=lock,
     )  # fmt: skip
 
 

@@ -10,8 +10,16 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from sqlalchemy import create_engine, text
+
+from tests.metrology.chains import comb_calibration
+from tests.unit.judge.rendered import COMB, image, options, recorded_cell
+from wearline.artifact import Calibration
+from wearline.cli import main
+from wearline.messages import Verdict
 
 
 def _tools() -> Path | None:
@@ -53,6 +61,36 @@ def postgres() -> Iterator[str]:
     finally:
         run(str(tools / "pg_ctl"), "-D", cluster, "-m", "immediate", "-w", "stop")
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Frames good, bad and hopeless, with calibration, recipe and template."""
+    folder = tmp_path_factory.mktemp("frames")
+    found = comb_calibration(COMB, (0.0, 0.0, 3.0, 3.0, 6.0, 6.0))
+    Calibration.from_bytes(found.to_bytes(), "c").save(folder / "C.npz")
+    (folder / "R.yaml").write_text("mm_per_pixel: 0.1\n")
+    for n in range(4):
+        cv2.imwrite(str(folder / f"g{n}.png"), image(0.0, 20 + n))
+    cv2.imwrite(str(folder / "good.png"), image(0.0, 40))
+    cv2.imwrite(str(folder / "bad.png"), image(0.25, 41))
+    cv2.imwrite(str(folder / "black.png"), np.zeros((480, 640), np.uint8))
+    cv2.imwrite(str(folder / "white.png"), np.full((480, 640), 255, np.uint8))
+    cv2.imwrite(str(folder / "small.png"), image(0.0, 42)[:240, :320])
+    cv2.imwrite(str(folder / "deep.png"), np.zeros((480, 640), np.uint16))
+    cv2.imwrite(str(folder / "colour.png"), np.zeros((480, 640, 3), np.uint8))
+    whole = (folder / "good.png").read_bytes()
+    (folder / "cut.png").write_bytes(whole[: len(whole) // 2])
+    (folder / "text.png").write_text("not an image\n")
+    assert main(["template", *(str(folder / f"g{n}.png") for n in range(4)), *options(folder, template=False),
+                 "--out", str(folder / "T.npz")]) == 0  # fmt: skip
+    return folder
+
+
+@pytest.fixture
+def recorded(files: Path, tmp_path: Path) -> tuple[Path, Verdict]:
+    """A cell with two recorded parts and their frames; the verdict is that of the failed one."""
+    return recorded_cell(files, tmp_path)
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

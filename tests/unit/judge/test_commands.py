@@ -7,69 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 import pytest
-import yaml
-from numpy.typing import NDArray
 
-from tests.metrology.chains import comb_calibration
-from tests.metrology.renderer import Comb, draw
+from tests.unit.judge.rendered import cell_file, image, options, usage
 from wearline.artifact import Calibration, Template
 from wearline.cli import main
-from wearline.config import CellSettings
-from wearline.messages import Decision, Frame, LinePoints, MeasureRequest, ResultCode, Verdict
-from wearline.offline import Chain
-from wearline.recipe import Recipe
+from wearline.messages import Decision, ResultCode, Verdict
 from wearline_judge.commands.replay import differences
-from wearline_judge.config import JudgeSettings
-from wearline_judge.drivers.fingerprint import code_version
-from wearline_judge.drivers.references import StoredReferences
-from wearline_judge.service import Judge, open_stores
 
-COMB = Comb()
 KEYS = {
     "frame", "decision", "reason", "code", "mean_error_mm", "max_error_mm", "wear_mm", "deviating_area_mm2",
     "deviating_area_px", "coverage", "regions", "zones", "registration", "timings_ms",
 }  # fmt: skip
-
-
-def image(flaw_mm: float, seed: int) -> NDArray[np.uint8]:
-    """A hill that may bear a flat flake."""
-
-    def height(across: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.float64]:
-        z = 1.0 + 1.5 * np.exp(-0.5 * (((along - 320.0) / 110.0) ** 2 + ((across - 240.0) / 90.0) ** 2))
-        flake = (np.abs(along - 200.0) < 70.0) & (np.abs(across - 250.0) < 60.0)
-        return z + np.where(flake, flaw_mm, 0.0)
-
-    return draw(COMB, height, seed)[0]
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("frames")
-    found = comb_calibration(COMB, (0.0, 0.0, 3.0, 3.0, 6.0, 6.0))
-    Calibration.from_bytes(found.to_bytes(), "c").save(folder / "C.npz")
-    (folder / "R.yaml").write_text("mm_per_pixel: 0.1\n")
-    for n in range(4):
-        cv2.imwrite(str(folder / f"g{n}.png"), image(0.0, 20 + n))
-    cv2.imwrite(str(folder / "good.png"), image(0.0, 40))
-    cv2.imwrite(str(folder / "bad.png"), image(0.25, 41))
-    cv2.imwrite(str(folder / "black.png"), np.zeros((480, 640), np.uint8))
-    cv2.imwrite(str(folder / "white.png"), np.full((480, 640), 255, np.uint8))
-    cv2.imwrite(str(folder / "small.png"), image(0.0, 42)[:240, :320])
-    cv2.imwrite(str(folder / "deep.png"), np.zeros((480, 640), np.uint16))
-    cv2.imwrite(str(folder / "colour.png"), np.zeros((480, 640, 3), np.uint8))
-    whole = (folder / "good.png").read_bytes()
-    (folder / "cut.png").write_bytes(whole[: len(whole) // 2])
-    (folder / "text.png").write_text("not an image\n")
-    assert main(["template", *(str(folder / f"g{n}.png") for n in range(4)), *options(folder, template=False),
-                 "--out", str(folder / "T.npz")]) == 0  # fmt: skip
-    return folder
-
-
-def options(folder: Path, template: bool = True) -> list[str]:
-    held = ["--calibration", str(folder / "C.npz"), "--recipe", str(folder / "R.yaml")]
-    return [*held, "--template", str(folder / "T.npz")] if template else held
 
 
 def lines(capsys: pytest.CaptureFixture[str], *arguments: str) -> list[dict[str, Any]]:
@@ -116,14 +65,6 @@ def test_a_file_that_is_no_frame_is_not_measured_and_the_run_goes_on(
 def test_a_line_for_people(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["judge", str(files / "bad.png"), *options(files)]) == 0
     assert "FAILED, mean error 0.2" in capsys.readouterr().out
-
-
-def usage(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    capsys.readouterr()
-    assert main([*arguments]) == 2
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1 and err.startswith("wearline: ") and ";" in err
-    return err
 
 
 def test_what_is_wrong_with_the_references_ends_the_run(
@@ -190,12 +131,6 @@ def test_a_template_says_what_it_is_made_of(files: Path) -> None:
     assert float((held.line_coverage >= 0.5).mean()) > 0.9
 
 
-def cell_file(folder: Path) -> Path:
-    path = folder / "cell.yaml"
-    path.write_text(yaml.safe_dump({"cell": "test", "data_dir": "run", "plc_is_simulated": True}))
-    return path
-
-
 def test_the_object_list_is_managed_from_a_terminal(
     files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -222,38 +157,12 @@ def test_the_object_list_is_managed_from_a_terminal(
     assert "--name" in usage(capsys, "recipe", "add", *config, "--object", "2", *options(files))
 
 
-@pytest.fixture
-def recorded(files: Path, tmp_path: Path) -> tuple[Path, Verdict]:
-    """A cell with one recorded, failed cycle and its frame."""
-    config = cell_file(tmp_path)
-    assert main(["recipe", "add", "--config", str(config), "--object", "1", "--name", "tray", *options(files)]) == 0
-    settings = JudgeSettings()
-    stores = open_stores(CellSettings(cell="test", data_dir=tmp_path / "run"), settings)
-    judge = Judge("test", settings, StoredReferences(stores.objects, stores.blobs), stores, version=code_version())
-    chain = Chain(Recipe(mm_per_pixel=0.1), (files / "C.npz").read_bytes(), (files / "T.npz").read_bytes())
-    frame: Frame = chain.frame(image(0.25, 60), asked())
-    points: LinePoints = chain.points_of(frame)
-    list(judge.start(chain))
-    list(judge.on_frame(frame))
-    verdict, *_ = judge.on_line_points(points)
-    list(judge.on_line_points(points.replace(cycle_id="c-2", refusal_code=16, refusal="camera fault")))
-    judge.close()
-    assert isinstance(verdict, Verdict) and verdict.decision is Decision.FAILED
-    return config, verdict
-
-
-def asked() -> MeasureRequest:
-    return MeasureRequest(
-        cycle_id="c-1", is_simulated=True, object_index=1, part_id="P1", stroke=8, measure_number=3, time_left_ms=2000.0
-    )
-
-
 def test_a_recorded_verdict_is_computed_again_bit_for_bit(
     recorded: tuple[Path, Verdict], capsys: pytest.CaptureFixture[str]
 ) -> None:
     config, _ = recorded
     capsys.readouterr()
-    assert main(["replay", "c-1", "--config", str(config)]) == 0
+    assert main(["replay", "c-8", "--config", str(config)]) == 0
     out = capsys.readouterr().out
     assert "recorded FAILED, computed FAILED" in out and "equal bit for bit" in out
 
@@ -265,7 +174,7 @@ def test_replay_tells_a_verdict_that_does_not_follow_from_its_frame(
 
     def record(changed: Verdict) -> tuple[int, str]:
         monkeypatch.setattr("wearline_judge.drivers.records.RecordStore.verdict", lambda *_: changed)
-        code = main(["replay", "c-1", "--config", str(config)])
+        code = main(["replay", "c-8", "--config", str(config)])
         return code, capsys.readouterr().out
 
     assert verdict.mean_error_mm is not None
@@ -283,13 +192,13 @@ def test_replay_refuses_what_cannot_be_computed(
     recorded: tuple[Path, Verdict], capsys: pytest.CaptureFixture[str]
 ) -> None:
     config, verdict = recorded
-    assert "has no record" in usage(capsys, "replay", "c-9", "--config", str(config))
-    assert "camera fault" in usage(capsys, "replay", "c-2", "--config", str(config))
+    assert "has no record" in usage(capsys, "replay", "c-77", "--config", str(config))
+    assert "camera fault" in usage(capsys, "replay", "c-10", "--config", str(config))
     (stored,) = (config.parent / "run" / "judge" / "frames").glob(f"failed/*/{verdict.frame_hash}.png")
     cv2.imwrite(str(stored), image(0.25, 61))
-    assert "was altered" in usage(capsys, "replay", "c-1", "--config", str(config))
+    assert "was altered" in usage(capsys, "replay", "c-8", "--config", str(config))
     stored.unlink()
-    assert "not stored" in usage(capsys, "replay", "c-1", "--config", str(config))
+    assert "not stored" in usage(capsys, "replay", "c-8", "--config", str(config))
 
 
 def test_differences_name_the_place() -> None:

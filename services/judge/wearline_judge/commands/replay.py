@@ -9,21 +9,10 @@ from typing import Any
 import cv2
 
 from wearline.cli import Command
-from wearline.config import load_cell, validated
-from wearline.errors import UsageError
-from wearline.messages import ResultCode, Verdict
-from wearline.offline import Chain
-from wearline_judge.config import JudgeSettings
-from wearline_judge.drivers.blobs import BlobStore
+from wearline.messages import Verdict
+from wearline_judge.commands.stored import stored_cell
 from wearline_judge.drivers.fingerprint import code_version
-from wearline_judge.drivers.frames import FrameStore
-from wearline_judge.service import open_records
 
-_OF_THE_FRAME = (
-    ResultCode.PASSED, ResultCode.FAILED, ResultCode.UNSURE, ResultCode.COVERAGE, ResultCode.BAD_FRAME,
-    ResultCode.REGISTRATION,
-)  # fmt: skip
-"""Codes that follow from frame and references alone."""
 _DIGITS = 3
 """Of a millimetre: 1 um."""
 
@@ -60,33 +49,10 @@ def _configure(parser: ArgumentParser) -> None:
 
 def _run(arguments: Namespace) -> int:
     cv2.setNumThreads(1)
-    cell = load_cell(arguments.config)
-    settings = validated(JudgeSettings, cell.judge, f"{arguments.config}: judge")
-    folder = cell.data_folder("judge")
-    records = open_records(cell, settings, must_exist=True)
-    try:
-        recorded = records.verdict(arguments.cycle_id)
-    finally:
-        records.close()
-    where = f"cycle {arguments.cycle_id}"
-    if recorded is None:
-        raise UsageError("has no record", where, "the production screen lists the cycles")
-    if recorded.code not in _OF_THE_FRAME:
-        raise UsageError(f"was not judged by its frame ({recorded.reason})", where, "there is nothing to compute again")
-    blobs, frames = BlobStore(folder), FrameStore(folder / "frames", settings.model_copy(update={"frames_quota_mb": 0}))
-    pixels = frames.get(recorded.frame_hash)
-    chain = Chain(
-        blobs.recipe(recorded.recipe_hash),
-        blobs.artifact(recorded.calibration_hash) if recorded.calibration_hash else None,
-        blobs.artifact(recorded.template_hash) if recorded.template_hash else None,
-        object_index=recorded.request.object_index,
-        is_simulated=recorded.is_simulated,
-    )
-    try:
-        computed = chain.verdict(pixels, recorded.request)
-    finally:
-        chain.close()
-    return _compare(recorded, computed, where)
+    with stored_cell(arguments.config) as stored:
+        recorded = stored.verdict(arguments.cycle_id)
+        _, computed, _, _ = stored.computed(recorded)
+    return _compare(recorded, computed, f"cycle {arguments.cycle_id}")
 
 
 def _compare(recorded: Verdict, computed: Verdict, where: str) -> int:

@@ -6,10 +6,8 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from wearline.cli import Command, progress
-from wearline.config import load_cell, validated
-from wearline_judge.config import JudgeSettings
+from wearline_judge.commands.stored import stored_cell
 from wearline_judge.drivers.chain import ChainError
-from wearline_judge.service import open_records
 
 
 def _configure(parser: ArgumentParser) -> None:
@@ -17,17 +15,14 @@ def _configure(parser: ArgumentParser) -> None:
 
 
 def _run(arguments: Namespace) -> int:
-    cell = load_cell(arguments.config)
-    records = open_records(cell, validated(JudgeSettings, cell.judge, f"{arguments.config}: judge"), must_exist=True)
-    try:
+    with stored_cell(arguments.config) as stored:
         total = 0
-        for _ in progress(records.verified(), "verify", records.count_entries()):
-            total += 1
-    except ChainError as error:
-        print(f"{arguments.config}: {error}")
-        return 1
-    finally:
-        records.close()
+        try:
+            for _ in progress(stored.records.verified(), "verify", stored.records.count_entries()):
+                total += 1
+        except ChainError as error:
+            print(f"{arguments.config}: {error}")
+            return 1
     print(f"{arguments.config}: {total} entries, none altered")
     return 0
 

@@ -454,6 +454,42 @@ class RecordStore:
             body = db.execute(asked).scalar()
         return None if body is None else Verdict.model_validate_json(body)
 
+    def outcome(self, cycle_id: str) -> Outcome | None:
+        """What the PLC was told of a cycle."""
+        asked = select(ENTRY.c.body).where(ENTRY.c.kind == "outcome", ENTRY.c.cycle_id == cycle_id)
+        with self._reading() as db:
+            body = db.execute(asked).scalar()
+        return None if body is None else Outcome.model_validate_json(body)
+
+    def cycles(self, last: int | None = None, object_index: int | None = None) -> Iterator[tuple[int, Cycle]]:
+        """Record number and whole cycle, oldest first; `last` = the newest so many."""
+        numbers: Select[Any] = select(RECORD.c.number).order_by(RECORD.c.number.desc())
+        if object_index is not None:
+            numbers = numbers.where(RECORD.c.object_index == object_index)
+        with self._reading() as db:
+            first = db.execute(numbers.offset(last - 1).limit(1)).scalar() if last is not None else None
+        told = ENTRY.alias("told")
+        after = (first or 1) - 1
+        while True:
+            asked = (
+                select(RECORD.c.number, RECORD.c.utc, RECORD.c.monotonic_s, ENTRY.c.body, told.c.body)
+                .join(ENTRY, ENTRY.c.number == RECORD.c.number)
+                .outerjoin(told, (told.c.kind == "outcome") & (told.c.cycle_id == RECORD.c.cycle_id))
+                .where(RECORD.c.number > after)
+                .order_by(RECORD.c.number)
+                .limit(_AT_ONCE)
+            )
+            if object_index is not None:
+                asked = asked.where(RECORD.c.object_index == object_index)
+            with self._reading() as db:
+                found = list(db.execute(asked))
+            for number, utc, monotonic_s, body, said in found:
+                outcome = None if said is None else Outcome.model_validate_json(said)
+                yield int(number), Cycle(Verdict.model_validate_json(body), outcome, utc, float(monotonic_s))
+            if len(found) < _AT_ONCE:
+                return
+            after = int(found[-1][0])
+
     def counts(self, object_index: int | None = None) -> dict[Decision, int]:
         """How many records of each decision."""
         asked = select(TALLY.c.decision, func.sum(TALLY.c.count)).group_by(TALLY.c.decision)
@@ -517,6 +553,13 @@ class RecordStore:
         with self._reading() as db:
             found = db.execute(asked.order_by(RECORD.c.number.desc()).limit(1)).scalar()
         return None if found is None else int(found)
+
+    def newest_utc(self, object_index: int) -> datetime | None:
+        """When the newest record of an object was made."""
+        asked = select(RECORD.c.utc).where(RECORD.c.object_index == object_index)
+        with self._reading() as db:
+            found: datetime | None = db.execute(asked.order_by(RECORD.c.number.desc()).limit(1)).scalar()
+        return found
 
     def first_stroke(self, object_index: int) -> int | None:
         """Stroke of the oldest record of an object."""
