@@ -13,7 +13,7 @@ from wearline.artifact import Calibration, Template
 from wearline.cli import Command, progress
 from wearline.config import load_cell, validated
 from wearline.errors import RecordError, UsageError
-from wearline.messages import LinePoints, Verdict, View
+from wearline.messages import AskRecords, LinePoints, Verdict, View
 from wearline.surface import dense_map
 from wearline_judge.commands.stored import OF_THE_FRAME, StoredCell, stored_cell
 from wearline_judge.config import JudgeSettings
@@ -133,7 +133,7 @@ def _report(stored: StoredCell, recorded: Verdict, out: Path) -> int:
             pictures = _pictures(frame.pixels, view)
         except RecordError as error:
             note = f"; without pictures: {error}"
-    (row,) = stored.records.rows(1, cycle_id=recorded.cycle_id)
+    (row,) = stored.records.rows(AskRecords(last=1, cycle_id=recorded.cycle_id))
     listed = stored.objects.objects().get(recorded.request.object_index)
     write_report(
         out, stored.cell.cell, row.record_id, row.utc, listed.name if listed else "", recorded,

@@ -31,14 +31,14 @@ def _run(arguments: Namespace) -> int:
     moves: Counter[tuple[str, str]] = Counter()
     left_out: Counter[str] = Counter()
     with stored_cell(arguments.config) as stored:
-        rows = stored.records.rows(arguments.last, arguments.object)
-        if not rows:
+        total = min(sum(stored.records.counts(arguments.object).values()), arguments.last)
+        if not total:
             raise UsageError("has no such records", str(arguments.config), "see --object")
-        for row in progress(rows, "rejudge"):
-            if row.code not in OF_THE_FRAME:
+        for _, cycle in progress(stored.records.cycles(arguments.last, arguments.object), "rejudge", total):
+            recorded = cycle.verdict
+            if recorded is None or recorded.code not in OF_THE_FRAME:
                 left_out["not judged by a frame"] += 1
                 continue
-            recorded = stored.verdict(row.cycle_id)
             try:
                 _, computed, _, _ = stored.computed(recorded, recipe)
             except RecordError as error:
@@ -48,13 +48,16 @@ def _run(arguments: Namespace) -> int:
             moves[old, new] += 1
             if arguments.json:
                 told = {
-                    "cycle_id": row.cycle_id, "stroke": row.stroke, "part_id": row.part_id, "recorded": old,
-                    "rejudged": new, "reason": computed.reason, "recorded_mean_error_mm": recorded.mean_error_mm,
-                    "mean_error_mm": computed.mean_error_mm,
+                    "cycle_id": recorded.cycle_id, "stroke": recorded.request.stroke,
+                    "part_id": recorded.request.part_id, "recorded": old, "rejudged": new, "reason": computed.reason,
+                    "recorded_mean_error_mm": recorded.mean_error_mm, "mean_error_mm": computed.mean_error_mm,
                 }  # fmt: skip
                 print(json.dumps(told), flush=True)
             elif old != new:
-                print(f"stroke {row.stroke}, cycle {row.cycle_id}: {old} -> {new}: {computed.reason}", flush=True)
+                print(
+                    f"stroke {recorded.request.stroke}, cycle {recorded.cycle_id}: {old} -> {new}: {computed.reason}",
+                    flush=True,
+                )
     if not arguments.json:
         _report(moves, left_out)
     return 0
