@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from wearline.topics import (
+    ACKNOWLEDGE,
     ARTIFACT,
     DIE_EVENT,
     DO_MEASURE,
@@ -32,6 +33,7 @@ from wearline.topics import (
     TEACH,
     VERDICT,
     VIEW,
+    WEAR_MAP,
     Query,
     Topic,
     alive_key,
@@ -53,7 +55,8 @@ ASKS: dict[str, tuple[Query, ...]] = {
     "judge": (JOURNAL,),
     "fieldbus": (RECIPE,),
     "hmi": (
-        RECIPE, RECIPE_LIST, RECORDS, TEACH, DIE_EVENT, DO_MEASURE, SELECT_OBJECT, MODE, SET_CAMERA,
+        RECIPE, RECIPE_LIST, RECORDS, WEAR_MAP, TEACH, DIE_EVENT, ACKNOWLEDGE, DO_MEASURE, SELECT_OBJECT, MODE,
+        SET_CAMERA,
     ),
 }  # fmt: skip
 """Questions and commands that a service may put to another."""

@@ -438,9 +438,11 @@ class RecordRow(Message):
 
 
 class WearTrend(Message):
-    """Wear of one object against the stroke counter, since the last die event."""
+    """Wear of one zone of one object against the stroke counter, since the last service of the die."""
 
     object_index: int
+    zone: str = ""
+    """Empty: the whole part."""
     points: tuple[tuple[int, float], ...]
     """(stroke, wear_mm), decimated to what a chart shows."""
     wear_mm: float | None
@@ -454,6 +456,16 @@ class WearTrend(Message):
     strokes_since_service: int
     die_events: tuple[tuple[int, str], ...] = ()
     """(stroke, what was done)."""
+    jumps: tuple[tuple[int, float], ...] = ()
+    """(stroke, size in mm) of sudden changes: a chip, a displaced insert."""
+    alarm_level: int = Field(default=0, ge=0, le=4)
+    """0 none, 1 info, 2 warning, 3 action, 4 stop; from 2 on held until acknowledged."""
+    alarm_reason: str = ""
+    alarm_stroke: int = 0
+    """At which this level was reached."""
+    acknowledged_by: str = ""
+    """Empty while somebody should look; then who did."""
+    acknowledged_reason: str = ""
 
 
 class Records(Message):
@@ -462,9 +474,31 @@ class Records(Message):
     rows: tuple[RecordRow, ...]
     total: int
     trends: tuple[WearTrend, ...] = ()
+    """Of each object: the whole part first, then its zones."""
     passed: int = 0
     failed: int = 0
     not_measured: int = 0
+
+
+class AskWearMap(Ask):
+    """`judge/wear_map`: where errors are frequent and where wear grows."""
+
+    object_index: int
+
+
+class WearMap(Message):
+    """Answer: maps over squares of the part, of all parts since the last service of the die."""
+
+    object_index: int
+    maps: Annotated[NDArray[np.float32], ArraySpec("float32", ("map", "row", "col"))]
+    """Maps in the order of `names`; NaN = no part was seen there, or too few for a slope."""
+    names: tuple[str, ...] = ("error_share", "slope_mm_per_kilostroke", "slope_sigma")
+    square_px: int
+    """Sensor pixels along the side of a square."""
+    origin_px: tuple[int, int]
+    """Sensor x, y of the first square's corner."""
+    parts: int
+    """Measured parts in it."""
 
 
 class Do(Message):
@@ -531,6 +565,14 @@ class DieEvent(Do):
     object_index: int
     kind: str = Field(pattern="^(regrind|polish|insert|die_change|coil_change)$")
     note: str = ""
+
+
+class Acknowledge(Do):
+    """`judge/do/acknowledge`: somebody took notice of an alarm; it goes when its cause has gone."""
+
+    object_index: int
+    zone: str = ""
+    reason: str = Field(min_length=1, max_length=500)
 
 
 class Done(Message):

@@ -77,6 +77,8 @@ ARTIFACT = Query("artifact/**", "judge", m.AskArtifact, m.Artifact)
 RECORDS = Query("records", "judge", m.AskRecords, m.Records)
 TEACH = Query("do/teach", "judge", m.Teach, m.Done)
 DIE_EVENT = Query("do/die_event", "judge", m.DieEvent, m.Done)
+ACKNOWLEDGE = Query("do/acknowledge", "judge", m.Acknowledge, m.Done)
+WEAR_MAP = Query("wear_map", "judge", m.AskWearMap, m.WearMap)
 DO_MEASURE = Query("do/measure", "fieldbus", m.DoMeasure, m.Done)
 SELECT_OBJECT = Query("do/select_object", "fieldbus", m.SelectObject, m.Done)
 MODE = Query("do/mode", "fieldbus", m.SetMode, m.Done)
@@ -84,7 +86,8 @@ JOURNAL = Query("do/journal", "fieldbus", m.AskJournal, m.Journal)
 SET_CAMERA = Query("do/set", "capture", m.SetCamera, m.Done)
 
 QUERIES: tuple[Query, ...] = (
-    RECIPE, RECIPE_LIST, ARTIFACT, RECORDS, TEACH, DIE_EVENT, DO_MEASURE, SELECT_OBJECT, MODE, JOURNAL, SET_CAMERA,
+    RECIPE, RECIPE_LIST, ARTIFACT, RECORDS, TEACH, DIE_EVENT, ACKNOWLEDGE, WEAR_MAP, DO_MEASURE, SELECT_OBJECT, MODE,
+    JOURNAL, SET_CAMERA,
 )  # fmt: skip
 
 

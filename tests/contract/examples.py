@@ -57,7 +57,7 @@ ROW = m.RecordRow(
 TREND = m.WearTrend(
     object_index=3, points=((1, 0.01), (2, 0.02)), wear_mm=0.02, slope_mm_per_kilostroke=10.0, slope_sigma=None,
     limit_mm=0.1, remaining_p10=None, remaining_p50=8.0, remaining_p90=None, strokes_since_service=2,
-    die_events=((0, "regrind"),),
+    die_events=((0, "regrind"),), zone="radius", jumps=((5, 0.02),), alarm_level=2, alarm_reason="near", alarm_stroke=4,
 )  # fmt: skip
 
 EXAMPLES: tuple[m.Message, ...] = (
@@ -99,5 +99,11 @@ EXAMPLES: tuple[m.Message, ...] = (
     m.SetMode(mode="auto"), m.AskJournal(),
     m.JournalEntry(request=REQUEST, is_simulated=True, accepted_utc="2026-01-01T00:00:00+00:00", outcome=OUTCOME),
     m.Journal(entries=()), m.SetCamera(exposure_us=500.0), m.Teach(object_index=3, cycle_ids=("a", "b")),
-    m.DieEvent(object_index=3, kind="regrind"), m.Done(ok=False, text="not now"),
+    m.DieEvent(object_index=3, kind="regrind"), m.Acknowledge(object_index=3, zone="radius", reason="seen, next break"),
+    m.AskWearMap(object_index=3),
+    m.WearMap(
+        object_index=3, maps=np.array([[[np.nan, 0.5]], [[2.0, 3.0]], [[0.1, 0.2]]], np.float32), square_px=32,
+        origin_px=(0, 8), parts=7,
+    ),
+    m.Done(ok=False, text="not now"),
 )  # fmt: skip
