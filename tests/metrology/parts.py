@@ -110,9 +110,13 @@ class Bench:
     chain: Prepared
     golden: Golden
 
+    def points_of(self, pixels: NDArray[np.uint8]) -> LinePoints:
+        """One frame, measured."""
+        return line_points(reconstruct(pixels, self.chain))
+
     def measure(self, surface: Surface, light: str, seed: int) -> LinePoints:
         """One frame of a part, measured."""
-        return line_points(reconstruct(lit(self.head, surface, light, seed), self.chain))
+        return self.points_of(lit(self.head, surface, light, seed))
 
     def setup(self, recipe: Recipe | None = None) -> Setup:
         """For a recipe."""
