@@ -13,6 +13,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -154,18 +155,18 @@ def fingerprint() -> str:
 def tasks(chosen: argparse.Namespace) -> Iterator[tuple[str, Callable[[], Result]]]:
     """Key and work, in an order that gives every series something early."""
     for number in range(20):
-        yield f"thesis/{number}", lambda n=number: thesis_result(n)
+        yield f"thesis/{number}", partial(thesis_result, number)
     for number in range(max(chosen.good, chosen.flakes, chosen.verdicts)):
         if number < chosen.flakes:
             for light in LIGHTS:
                 for thickness in (0.2, 0.1):
                     key = f"flake/{thickness}/{light}/{number}"
-                    yield key, lambda t=thickness, li=light, n=number: flake_result(t, li, n)
+                    yield key, partial(flake_result, thickness, light, number)
         if number < chosen.good:
             light = LIGHTS[number % 3]
-            yield f"good/{light}/{number}", lambda li=light, n=number: good_result(li, n)
+            yield f"good/{light}/{number}", partial(good_result, light, number)
         if number < chosen.verdicts:
-            yield f"verdict/{number}", lambda n=number: verdict_result(n)
+            yield f"verdict/{number}", partial(verdict_result, number)
 
 
 def interval95(hits: int, of: int) -> tuple[float, float]:
@@ -217,8 +218,8 @@ def summary(results: dict[str, Result]) -> list[str]:
         lines += [
             f"mean error of a worn zone: scores of mean {scores.mean():+.2f}, sd {scores.std():.2f},"
             f" {100 * float(np.mean(np.abs(scores) < 1.96)):.1f} % within 95 %, of {len(scores)}",
-            f"limits within 2.5 standard uncertainties of the truth, guard band 95 %: {accepted} of {len(bad)} bad parts"
-            f" accepted, {rejected} of {len(fine)} good ones rejected, {unsure} of {len(verdicts)} unsure",
+            f"limits within 2.5 standard uncertainties of the truth, guard band 95 %: {accepted} of {len(bad)} bad"
+            f" parts accepted, {rejected} of {len(fine)} good ones rejected, {unsure} of {len(verdicts)} unsure",
         ]
     table = [results[f"thesis/{n}"] for n in range(20) if f"thesis/{n}" in results]
     if len(table) == 20:

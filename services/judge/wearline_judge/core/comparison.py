@@ -288,9 +288,8 @@ def compare(
     motion = register(flat_residual, flat_place, use.ravel(), registration, scale is not None, datum is not None)
     deviation, guess = residual(motion)
 
-    steepness = np.hypot(place.slope_x, place.slope_y)
-    position = np.hypot(settings.position_sigma_mm if scale else settings.position_sigma_mm * 10.0, motion.shift_sigma)
-    common2 = cells.natural_mm2 + (steepness * position) ** 2 + motion.height_sigma_mm**2
+    own = settings.position_sigma_mm if scale else settings.position_sigma_mm * 10.0
+    common2 = cells.natural_mm2 + motion.place_sigma(place, own) ** 2 + motion.height_sigma_mm**2
     usual = float(np.nanmedian(noise2)) if np.isfinite(noise2).any() else 0.0
     # What reconstruct states above the usual (steep walls, ends of lines) has its own reasons.
     scatter = _scatter(deviation, noise2, common2 + guess**2)

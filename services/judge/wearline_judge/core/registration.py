@@ -95,8 +95,8 @@ class Motion:
     undetermined: tuple[str, ...] = ()
     scale_mm: float = 0.0
     """Robust standard deviation of what is left. [mm]"""
-    shift_sigma: float = 0.0
-    """Standard uncertainty of the move in plane in the directions that were determined."""
+    plane_root: tuple[tuple[float, float, float], ...] = ()
+    """Rows r with sum r r^T = covariance of (dx, dy, turn); empty when no move in plane was found."""
     height_sigma_mm: float = 0.0
     """Standard uncertainty of dz. [mm]"""
 
@@ -112,6 +112,14 @@ class Motion:
             self.dx - self.turn * cells.y - self.tilt_y * cells.height_mm + cells.x * nearer,
             self.dy + self.turn * cells.x - self.tilt_x * cells.height_mm + cells.y * nearer,
         )
+
+    def place_sigma(self, cells: Cells, own: float) -> F64:
+        """Uncertainty of heights by where the part lies: that of the move, and `own` of each place by itself. [mm]"""
+        gx, gy = cells.slope_x, cells.slope_y
+        variance = (gx * gx + gy * gy) * own**2
+        for dx, dy, turn in self.plane_root:
+            variance = variance + (gx * (dx - turn * cells.y) + gy * (dy + turn * cells.x)) ** 2
+        return np.sqrt(variance)
 
     def rise(self, cells: Cells) -> F64:
         """What dz and the tilts add to the height. [mm]"""
@@ -206,9 +214,9 @@ def register(
     still, still_reach = _robust(flat, start[use], weight)
     still_motion = Motion(float(still[0]), float(still[1]), float(still[2]))
     still_rest = residual_of(still_motion)[0][use]
-    axes, sigmas, names = _determined(plane, flat, sigma, settings, is_in_mm, float(np.mean(np.hypot(near.x, near.y))))
+    axes, root, names = _determined(plane, flat, sigma, settings, is_in_mm, float(np.mean(np.hypot(near.x, near.y))))
     moved = still_motion
-    shift_sigma = 0.0
+    plane_root: tuple[tuple[float, float, float], ...] = ()
     if axes.shape[1]:
         full, full_reach = _gauss_newton(residual_of, use, flat, plane @ axes, axes, still_motion, is_in_mm)
         held = _held(full, settings, is_in_mm, has_datum)
@@ -224,13 +232,13 @@ def register(
             weight = _weight(doubt)
             before, after = (_cost(r[both], weight[both], reach) for r in (still_rest, rest))
             if has_datum or after < (1.0 - settings.gain_min) * before:
-                moved, shift_sigma = full, float(np.max(sigmas))
+                moved, plane_root = full, root
     left = residual_of(moved)[0][use]
     left = left[np.isfinite(left)]
     scale = _spread_of(left - float(np.median(left))) if left.size else 0.0
     independent = max(left.size * BLOCK / settings.correlation_px, 1.0)
     return Motion(
-        moved.dz_mm, moved.tilt_x, moved.tilt_y, moved.dx, moved.dy, moved.turn, names, scale, shift_sigma,
+        moved.dz_mm, moved.tilt_x, moved.tilt_y, moved.dx, moved.dy, moved.turn, names, scale, plane_root,
         max(scale, float(np.median(sigma))) / float(np.sqrt(independent)),
     )  # fmt: skip
 
@@ -273,12 +281,12 @@ def _held(motion: Motion, settings: RegistrationSettings, is_in_mm: bool, has_da
 
 def _determined(
     plane: F64, flat: F64, sigma: F64, settings: RegistrationSettings, is_in_mm: bool, radius: float
-) -> tuple[F64, F64, tuple[str, ...]]:
+) -> tuple[F64, tuple[tuple[float, float, float], ...], tuple[str, ...]]:
     """Moves in plane that the surface determines.
 
     Returns:
-        directions as columns (3, k) over (dx, dy, turn); their sigmas (k,) as lengths, a turn counting as
-        the path of a point at the mean radius; the names of what is not determined.
+        directions as columns (3, k) over (dx, dy, turn); rows whose outer products add up to the covariance
+        of these three; the names of what is not determined.
     """
     alike = max(settings.correlation_px / BLOCK, 1.0)
     root = 1.0 / np.sqrt(alike * (sigma * sigma + _NOISE_FLOOR_MM**2))[:, None]
@@ -292,17 +300,19 @@ def _determined(
     sigmas = 1.0 / np.sqrt(np.maximum(values, 1e-12))
     enough = sigmas <= (settings.shift_sigma_max_mm if is_in_mm else settings.shift_sigma_max_mm * 10.0)
     if enough.all():
-        return np.diag(lengths), sigmas, ()
-    lost = vectors[:, ~enough]
-    # An undetermined direction that is nearly one of the part's axes is that one: the others stay pure.
-    snapped = np.eye(3)[:, [int(np.argmax(np.abs(v))) for v in lost.T]]
-    if np.all(np.max(np.abs(lost), axis=0) > 0.95) and np.linalg.matrix_rank(snapped) == lost.shape[1]:
-        axes = np.eye(3)[:, ~snapped.any(axis=1)]
+        axes = np.eye(3)
     else:
-        axes = vectors[:, enough]
+        lost = vectors[:, ~enough]
+        # An undetermined direction that is nearly one of the part's axes is that one: the others stay pure.
+        snapped = np.eye(3)[:, [int(np.argmax(np.abs(v))) for v in lost.T]]
+        if np.all(np.max(np.abs(lost), axis=0) > 0.95) and np.linalg.matrix_rank(snapped) == lost.shape[1]:
+            axes = np.eye(3)[:, ~snapped.any(axis=1)]
+        else:
+            axes = vectors[:, enough]
     share = np.sum(axes * axes, axis=1)
     names = tuple(n for n, s in zip(_IN_PLANE, share, strict=True) if s < 0.75)
-    return lengths[:, None] * axes, sigmas[enough], names
+    rows = (lengths[:, None] * vectors[:, enough] * sigmas[enough]).T
+    return lengths[:, None] * axes, tuple((float(r[0]), float(r[1]), float(r[2])) for r in rows), names
 
 
 def out_of_pose(motion: Motion, settings: RegistrationSettings, is_in_mm: bool) -> str | None:
