@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
+from typing import Protocol
 
 from reportlab.graphics.shapes import Circle, Drawing, Line, PolyLine, String
 from reportlab.lib import colors
@@ -15,12 +16,63 @@ from reportlab.lib.styles import ParagraphStyle, getSampleStyleSheet
 from reportlab.lib.units import mm
 from reportlab.platypus import KeepTogether, Paragraph, SimpleDocTemplate, Spacer, Table, TableStyle
 
-from wearline_judge.core.capability import Capability, Chart, Figure, Study
-
 _WIDTH, _HEIGHT = 470.0, 190.0
 _LEFT, _BOTTOM, _TOP, _RIGHT = 62.0, 34.0, 26.0, 74.0
 _INK, _LEVEL, _GRID = "#1d3557", "#b3541e", "#c8ccd2"
-_TONE = {Capability.CAPABLE: "#1b6e3c", Capability.CONDITIONAL: "#8a5a00", Capability.NOT_CAPABLE: "#a11d1d"}
+_GOOD, _AMBER, _BAD = "#1b6e3c", "#8a5a00", "#a11d1d"
+_TONE = {"capable": _GOOD, "conditionally capable": _AMBER}
+"""Of an outcome; what is not named here is bad."""
+
+
+class Chart(Protocol):
+    """What a study's picture shows."""
+
+    @property
+    def x_name(self) -> str: ...
+    @property
+    def y_name(self) -> str: ...
+    @property
+    def x(self) -> Sequence[float]: ...
+    @property
+    def y(self) -> Sequence[float]: ...
+    @property
+    def levels(self) -> Sequence[tuple[str, float]]: ...
+    @property
+    def is_joined(self) -> bool: ...
+    @property
+    def fitted(self) -> Sequence[tuple[float, float]]: ...
+
+
+class Figure(Protocol):
+    """One line of a study's table."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def value(self) -> float: ...
+    @property
+    def unit(self) -> str: ...
+    @property
+    def condition(self) -> str: ...
+    @property
+    def is_met(self) -> bool | None: ...
+
+
+class Study(Protocol):
+    """What a report needs of a study."""
+
+    @property
+    def title(self) -> str: ...
+    @property
+    def outcome(self) -> str: ...
+    @property
+    def sentence(self) -> str: ...
+    @property
+    def figures(self) -> Sequence[Figure]: ...
+    @property
+    def chart(self) -> Chart: ...
+    @property
+    def notes(self) -> Sequence[str]: ...
 
 
 @dataclass(frozen=True)
@@ -186,7 +238,7 @@ def html_report(head: ReportHead, studies: Sequence[Study]) -> str:
     parts += [f"<tr><th>{html.escape(n)}</th><td>{html.escape(t)}</td></tr>" for n, t in _facts(head)]
     parts.append("</table>")
     for study in studies:
-        tone = _TONE[study.outcome]
+        tone = _TONE.get(study.outcome, _BAD)
         parts.append(f"<section><h2>{html.escape(study.title)}</h2>")
         parts.append(f'<p style="color:{tone};font-weight:600">{html.escape(_sentence(study.sentence))}</p>')
         parts.append(_svg(study.chart))
@@ -223,7 +275,7 @@ def pdf_report(head: ReportHead, studies: Sequence[Study]) -> bytes:
     )
     for study in studies:
         tone = ParagraphStyle(
-            "outcome", parent=body, textColor=colors.HexColor(_TONE[study.outcome]), fontName="Helvetica-Bold"
+            "outcome", parent=body, textColor=colors.HexColor(_TONE.get(study.outcome, _BAD)), fontName="Helvetica-Bold"
         )
         rows = [["figure", "value", "asked", ""], *(list(_shown(f)) for f in study.figures)]
         block = [
