@@ -10,7 +10,7 @@ import pytest
 from tests.system.cell import SimulatedCell, cycle_seconds
 from wearline.messages import Outcome
 
-STROKES = 8
+STROKES = 6
 
 
 def test_a_cell_that_dies_does_not_touch_its_neighbour(
@@ -26,19 +26,24 @@ def test_a_cell_that_dies_does_not_touch_its_neighbour(
         for name in ("router", "fieldbus", "capture", "reconstruct", "judge", "hmi"):
             killed_s = left.kill(name)
         disturbed = told_after(right, killed_s, STROKES)
-        left.wait_until_measured(killed_s, within_s=20.0)
+        back_s = left.wait_until_measured(killed_s, within_s=20.0)
+        # What else this machine does may change meanwhile, so the quiet is measured before and after.
+        quiet_again = told_after(right, back_s, STROKES)
         neighbour, victim = right.books(), left.books()
     assert neighbour.audit() == []
     assert victim.audit() == []
     assert {line["code"] for line in neighbour.believed} <= {1, 2}, "the neighbour measured every part"
     strokes = [line["stroke"] for line in neighbour.believed]
     assert strokes == list(range(strokes[0], strokes[0] + len(strokes)))
-    before, after = cycle_seconds(quiet), cycle_seconds(disturbed)
+    before, meanwhile, after = (cycle_seconds(phase) for phase in (quiet, disturbed, quiet_again))
     with capsys.disabled():
-        print(f"\nneighbour's cycles: {told(before)}; while six processes of the other cell die: {told(after)}")
-    # Both cells share the processors of this machine, nothing else.
-    assert median(after) < 2.0 * median(before) + 0.2
-    assert max(after) < 2.5
+        print(
+            f"\nneighbour's cycles: {told(before)}; while six processes of the other cell die and come back: "
+            f"{told(meanwhile)}; afterwards: {told(after)}"
+        )
+    assert max(meanwhile) < 2.5
+    # Both cells share the processors of this machine, and nothing else.
+    assert median(meanwhile) < 2.0 * max(median(before), median(after)) + 0.2
 
 
 def told_after(cell: SimulatedCell, after_s: float, count: int) -> list[Outcome]:
