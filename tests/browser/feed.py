@@ -150,7 +150,9 @@ class Feed:
 
     def show(self, stroke: int) -> None:
         """A new camera picture."""
-        self._preview = m.Preview(jpeg=picture(stroke), frame_counter=stroke, is_simulated=self.is_simulated)
+        self._preview = m.Preview(
+            jpeg=picture(stroke), frame_counter=stroke, is_simulated=self.is_simulated, step_px=2.0
+        )
         self._buses["capture"].publish(self._preview)
 
     def stroke(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import nicegui.elements.scene  # noqa: F401  registers the three.js that surface.js imports
 from fastapi import FastAPI, HTTPException
 from fastapi.responses import Response
 from nicegui.element import Element
 
 from wearline.messages import View
+from wearline_hmi.core.charts import Ink
 from wearline_hmi.core.maps import ViewHeader, header_json, view_bytes
 from wearline_hmi.service import HmiService
 
@@ -23,6 +26,7 @@ def add_live(app: FastAPI, service: HmiService) -> None:
         headers = {"Cache-Control": "no-store"}
         if state.preview is None or state.preview_at_s is None or state.preview_heard_s is None:
             return Response(status_code=204, headers=headers)
+        headers["X-Step"] = f"{state.preview.step_px:g}"
         headers["X-Serial"] = str(state.preview_serial)
         headers["X-Age-Ms"] = f"{1000 * (now_s - state.preview_at_s):.0f}"
         headers["X-Heard-Ms"] = f"{1000 * (now_s - state.preview_heard_s):.0f}"
@@ -47,10 +51,28 @@ def add_live(app: FastAPI, service: HmiService) -> None:
 class LivePicture(Element, component="live_picture.js"):
     """The camera picture, polled: the newest frame wins and its age is seen."""
 
-    def __init__(self, words: dict[str, str], stale_s: float) -> None:
+    def __init__(self, words: dict[str, str], stale_s: float, across: str = "") -> None:
+        """With `across` (column or row) two lines can be moved over it, whose brightness `Brightness` shows."""
         super().__init__()
         self._props["words"] = words
         self._props["stale-s"] = stale_s
+        self._props["roi"] = None
+        self._props["across"] = across
+
+    def overlay(self, roi: tuple[int, int, int, int] | None, across: str) -> None:
+        """Draw the ROI (x, y, width, height on the sensor [px]) and let the lines cross the laser lines."""
+        self._props["roi"] = None if roi is None else list(roi)
+        self._props["across"] = across
+        self.update()
+
+
+class Brightness(Element, component="brightness.js"):
+    """Brightness along the two lines of the picture, histogram, saturation and focus; made in the browser."""
+
+    def __init__(self, words: dict[str, str], ink: Ink) -> None:
+        super().__init__()
+        self._props["words"] = words
+        self._props["ink"] = asdict(ink)
 
 
 class Surface(Element, component="surface.js"):

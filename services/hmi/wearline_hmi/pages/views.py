@@ -112,6 +112,7 @@ def picture_words(say: Language) -> dict[str, str]:
         "seconds": say("{n} s ago"),
         "minutes": say("{n} min ago"),
         "picture": say("Camera picture"),
+        "line": say("Line"),
     }
 
 

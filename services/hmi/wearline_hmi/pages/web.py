@@ -17,6 +17,7 @@ from wearline.errors import ConfigError, WearlineError
 from wearline_hmi.core import rights
 from wearline_hmi.drivers.accounts import Accounts
 from wearline_hmi.drivers.hashing import Hasher
+from wearline_hmi.pages.camera import build_camera
 from wearline_hmi.pages.frame import Site
 from wearline_hmi.pages.gate import Doorkeeper, Gate, add_gate
 from wearline_hmi.pages.live import add_live
@@ -128,6 +129,7 @@ def make_app(service: HmiService, keeper: Doorkeeper) -> FastAPI:
     add_live(app, service)
     site = Site(service, keeper)
     site.add("/", "Overview", rights.LOOK_AT_MEASURING, build_overview)
+    site.add("/camera", "Camera", rights.LOOK_AT_CAMERA, build_camera)
     site.add("/measurement", "Measurement", rights.LOOK_AT_MEASURING, build_measurement)
     run.process_pool_start_method = "spawn"
     core.sio.eio.cors_allowed_origins = []
