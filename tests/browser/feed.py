@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
 import time
@@ -22,6 +23,7 @@ from wearline.bus import Bus, open_router
 from wearline.config import CellSettings, load_cell
 from wearline.recipe import Recipe, dump_recipe
 from wearline.scene import StampedPart, part_of_stroke
+from wearline_fieldbus.core.profiles import BASIC, Direction, image_rows
 
 PUBLISHERS = ("capture", "reconstruct", "judge", "fieldbus")
 MAP_ROWS, MAP_COLS, STEP_MM = 90, 140, 0.9
@@ -131,6 +133,13 @@ class Feed:
                 "plc_link_up": self.is_link_up,
                 "ready": self.is_ready,
                 "object_index": self.object_index,
+                "image_rows": json.dumps(image_rows(BASIC, self._image()), separators=(",", ":")),
+                "profile": "basic",
+                "handshake": "idle",
+                "not_ready_because": "",
+                "longest_exchange_ms": 2.4,
+                "image_age_s": 0.02,
+                "journal_has_room": True,
             }
         elif name == "capture":
             values = {
@@ -142,6 +151,25 @@ class Feed:
         return m.ServiceState(
             service=name, status="ready", pid=1, uptime_s=time.monotonic() - self._started_s, version="0", values=values
         )
+
+    def _image(self) -> bytes:
+        """What is on the wire: the newest stroke's request and response."""
+        last = self._verdicts[-1] if self._verdicts else None
+        code = 0 if last is None else last.code
+        request = BASIC.encode(
+            {
+                "link_ok": self.is_link_up, "object_index": self.object_index,
+                "measure_number": 0 if last is None else last.request.measure_number,
+                "stroke": 0 if last is None else last.request.stroke,
+            }, Direction.REQUEST,
+        )  # fmt: skip
+        response = BASIC.encode(
+            {
+                "ready": self.is_ready, "measure_finished": code > 0, "passed": code == 1, "failed": code > 1,
+                "mode": self.mode == "auto", "simulated": True, "result_code": code,
+            }, Direction.RESPONSE,
+        )  # fmt: skip
+        return request + response
 
     def event(self, service: str, level: str, text: str, utc: str = "", cycle_id: str = "") -> None:
         """One line for the log."""
@@ -305,10 +333,14 @@ class Feed:
             for row in reversed(rows)
             if (not question.cycle_id or row.cycle_id == question.cycle_id)
             and (question.object_index is None or row.object_index == question.object_index)
+            and (not question.decisions or row.decision in question.decisions)
+            and (question.search.lower() in row.part_id.lower() or question.search == str(row.stroke))
+            and (question.before is None or row.record_id < question.before)
         ]
         count = {d: sum(row.decision is d for row in rows) for d in m.Decision}
         return m.Records(
-            rows=tuple(chosen[: question.last]), total=len(rows), trends=self._trends(verdicts),
+            rows=tuple(chosen[: question.last]), total=len(rows),
+            trends=self._trends(verdicts) if question.with_trends else (),
             passed=count[m.Decision.PASSED], failed=count[m.Decision.FAILED],
             not_measured=count[m.Decision.NOT_MEASURED],
         )  # fmt: skip

@@ -18,6 +18,7 @@ from wearline.topics import EVENTS, OUTCOME, PREVIEW, RECORDS, STATES, VERDICT, 
 from wearline_hmi.config import HmiSettings
 from wearline_hmi.core import state as cell_state
 from wearline_hmi.core.state import CellState
+from wearline_hmi.drivers.event_log import EventLog
 
 RECORDS_ASKED = 100
 RECORDS_TIMEOUT_S = 0.5
@@ -50,9 +51,11 @@ class HmiService(Service):
         settings: HmiSettings,
         open_web: Callable[[HmiService], Web] | None = None,
         clock: Callable[[], float] = time.monotonic,
+        event_log: EventLog | None = None,
     ) -> None:
         self.cell, self.settings, self.clock = cell, settings, clock
         self.snapshot = CellState(settings.title or cell.cell)
+        self.event_log = event_log
         self._open_web = open_web
         self._web: Web | None = None
         self._asker: Asker | None = None
@@ -114,6 +117,8 @@ class HmiService(Service):
 
     def on_event(self, event: Event) -> Iterable[Message]:
         self.snapshot = cell_state.with_event(self.snapshot, event)
+        if self.event_log is not None:
+            self.event_log.add(event)
         return ()
 
     def on_alive(self, service: str, is_alive: bool) -> Iterable[Message]:
@@ -150,3 +155,5 @@ class HmiService(Service):
     def close(self) -> None:
         if self._web is not None:
             self._web.close()
+        if self.event_log is not None:
+            self.event_log.close()

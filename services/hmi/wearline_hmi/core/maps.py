@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wearline.messages import View
+from wearline_hmi.core.state import Frequency
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,8 @@ class ViewHeader:
     scales: tuple[MapScale, ...]
     measured_share: float
     """Share of the elements of the standard that the measured map has too, 0-1."""
+    value_unit: str = "mm"
+    """Of the map's values."""
 
 
 def nice_above(value: float) -> float:
@@ -93,6 +96,21 @@ def view_header(view: View) -> ViewHeader:
             share = float(np.isfinite(maps[measured])[wanted].mean())
     unit = "mm" if view.mm_per_pixel else "px"
     return ViewHeader(view.cycle_id, view.stroke, view.names, rows, cols, step, unit, tuple(scales), share)
+
+
+def frequency_header(view: View, frequency: Frequency) -> ViewHeader:
+    """The map of how often each place deviated, on the grid of the views."""
+    rows, cols = frequency.measured.shape
+    step = view.step_px * (view.mm_per_pixel or 1.0)
+    top = float(np.nanmax(100.0 * frequency.share(), initial=0.0))
+    scale = MapScale(0.0, nice_above(max(top, 10.0)), "size", 1.0)
+    unit = "mm" if view.mm_per_pixel else "px"
+    return ViewHeader(view.cycle_id, view.stroke, ("frequency",), rows, cols, step, unit, (scale,), 1.0, "%")
+
+
+def frequency_bytes(frequency: Frequency) -> bytes:
+    """float32, little-endian, [row, col], in percent; NaN = never measured."""
+    return np.ascontiguousarray(100.0 * frequency.share(), dtype="<f4").tobytes()
 
 
 def header_json(header: ViewHeader) -> dict[str, object]:

@@ -5,15 +5,21 @@ A snapshot may be read by any thread; only the thread that handles messages make
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from wearline.messages import Event, Outcome, Preview, Records, ServiceState, Verdict, View, WearTrend
 from wearline.topics import SERVICES
 
 STROKES_KEPT = 200
 EVENTS_KEPT = 100
+CHANGES_KEPT = 200
+LIFE_SIGNALS = ("plc_life", "vision_life")
+"""They change all the time and would hide the others."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +56,35 @@ class Seen:
 
 
 @dataclass(frozen=True)
+class Frequency:
+    """How often each place of the maps of one object deviated, over the views that were seen."""
+
+    object_key: tuple[int | None, tuple[int, int]]
+    """Object index and size of the maps: another object begins anew."""
+    deviated: NDArray[np.int32]
+    """Strokes with an error there, (row, col)."""
+    measured: NDArray[np.int32]
+    """Strokes with a measurement there, (row, col)."""
+    views: int
+
+    def share(self) -> NDArray[np.float32]:
+        """Share of the measured strokes that deviated, (row, col), 0-1; NaN = never measured."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.where(self.measured > 0, self.deviated / self.measured, np.nan).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class SignalChange:
+    """One change of the process image, as seen in fieldbus' states."""
+
+    at_s: float
+    """Monotonic clock. [s]"""
+    name: str
+    before: str
+    after: str
+
+
+@dataclass(frozen=True)
 class CellState:
     """All that the page shows."""
 
@@ -61,6 +96,11 @@ class CellState:
     view_at_s: float | None = None
     view_before: View | None = None
     """A browser may still be fetching it."""
+    frequency: Frequency | None = None
+    signals: tuple[dict[str, Any], ...] = ()
+    """Rows of the process image as fieldbus tells them."""
+    signal_changes: tuple[SignalChange, ...] = ()
+    """Newest first."""
     preview: Preview | None = None
     preview_at_s: float | None = None
     """When this picture came first: a camera that takes no new one says the last one again."""
@@ -144,7 +184,20 @@ def with_view(state: CellState, view: View, now_s: float) -> CellState:
     """The snapshot with the newest maps; those that are said again keep their age."""
     if state.view is not None and state.view.cycle_id == view.cycle_id:
         return state
-    return replace(state, view=view, view_at_s=now_s, view_before=state.view)
+    frequency = _with_errors(state.frequency, view, current_object(state))
+    return replace(state, view=view, view_at_s=now_s, view_before=state.view, frequency=frequency)
+
+
+def _with_errors(known: Frequency | None, view: View, object_index: int | None) -> Frequency | None:
+    if "error" not in view.names:
+        return known
+    errors = view.maps_mm[view.names.index("error")]
+    is_measured = np.isfinite(errors)
+    deviates = is_measured & (np.nan_to_num(errors) != 0.0)
+    key = (object_index, (errors.shape[0], errors.shape[1]))
+    if known is None or known.object_key != key:
+        return Frequency(key, deviates.astype(np.int32), is_measured.astype(np.int32), 1)
+    return Frequency(key, known.deviated + deviates, known.measured + is_measured, known.views + 1)
 
 
 def with_preview(state: CellState, preview: Preview, now_s: float) -> CellState:
@@ -160,7 +213,31 @@ def with_preview(state: CellState, preview: Preview, now_s: float) -> CellState:
 def with_service(state: CellState, told: ServiceState, now_s: float) -> CellState:
     """The snapshot after a service said how it is."""
     seen = Seen(told, now_s, True)
-    return replace(state, services={**state.services, told.service: seen})
+    state = replace(state, services={**state.services, told.service: seen})
+    rows = _signals(told)
+    if rows is None:
+        return state
+    before = {row["name"]: row["value"] for row in state.signals}
+    changes = tuple(
+        SignalChange(now_s, str(row["name"]), str(before[row["name"]]), str(row["value"]))
+        for row in rows
+        if row["name"] in before and before[row["name"]] != row["value"] and row["name"] not in LIFE_SIGNALS
+    )
+    return replace(state, signals=rows, signal_changes=(*changes, *state.signal_changes)[:CHANGES_KEPT])
+
+
+def _signals(told: ServiceState) -> tuple[dict[str, Any], ...] | None:
+    text = told.values.get("image_rows")
+    if told.service != "fieldbus" or not isinstance(text, str):
+        return None
+    try:
+        rows = json.loads(text)
+    except ValueError:
+        return None
+    wanted = ("direction", "address", "type", "name", "value", "meaning")
+    if not isinstance(rows, list) or not all(isinstance(r, dict) and all(k in r for k in wanted) for r in rows):
+        return None
+    return tuple(rows)
 
 
 def with_alive(state: CellState, service: str, is_alive: bool) -> CellState:

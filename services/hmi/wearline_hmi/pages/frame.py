@@ -50,6 +50,8 @@ class Site:
     service: HmiService
     keeper: Doorkeeper
     screens: list[Screen] = field(default_factory=list)
+    asking: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
+    """However many look, no service is asked more than two things at once by browsers."""
 
     def add(self, path: str, title: str, deed: Deed, build: Callable[[Frame], None]) -> None:
         """Make a screen; the menu shows it to those who may see it."""
@@ -149,7 +151,8 @@ class Frame:
     async def ask(self, query: Query, question: Message, argument: str = "", timeout_s: float = 2.0) -> Message | None:
         """Another service's answer; None and a notice where there is none."""
         try:
-            return await asyncio.to_thread(self.service.ask, query, question, argument, timeout_s)
+            async with self.site.asking:
+                return await asyncio.to_thread(self.service.ask, query, question, argument, timeout_s)
         except BusError as error:
             ui.notify(str(error), type="negative", multi_line=True)
             return None

@@ -9,9 +9,8 @@ from fastapi import FastAPI, HTTPException
 from fastapi.responses import Response
 from nicegui.element import Element
 
-from wearline.messages import View
 from wearline_hmi.core.charts import Ink
-from wearline_hmi.core.maps import ViewHeader, header_json, view_bytes
+from wearline_hmi.core.maps import ViewHeader, frequency_bytes, header_json, view_bytes
 from wearline_hmi.service import HmiService
 
 
@@ -45,6 +44,16 @@ def add_live(app: FastAPI, service: HmiService) -> None:
             view_bytes(view),
             media_type="application/octet-stream",
             headers={"Cache-Control": "private, max-age=60, immutable"},
+        )
+
+    @app.get("/live/frequency/{cycle_id}.bin", include_in_schema=False)
+    async def frequency(cycle_id: str) -> Response:
+        """float32, little-endian, [row, col]: how often each place deviated. [%]"""
+        found = service.snapshot.frequency
+        if found is None:
+            raise HTTPException(404, "no maps came yet")
+        return Response(
+            frequency_bytes(found), media_type="application/octet-stream", headers={"Cache-Control": "no-store"}
         )
 
 
@@ -85,10 +94,10 @@ class Surface(Element, component="surface.js"):
         self._props["map"] = ""
         self._props["painting"] = "surface"
 
-    def show(self, header: ViewHeader, view: View) -> None:
-        """Show another view."""
-        if self._props["header"] is None or self._props["header"]["cycle_id"] != view.cycle_id:
-            self._props["header"] = {**header_json(header), "url": f"/live/maps/{view.cycle_id}.bin"}
+    def show(self, header: ViewHeader, kind: str = "maps") -> None:
+        """Show another view; `kind` is where its bytes are found below ``/live``."""
+        if self._props["header"] is None or self._props["header"]["cycle_id"] != header.cycle_id:
+            self._props["header"] = {**header_json(header), "url": f"/live/{kind}/{header.cycle_id}.bin"}
             self.update()
 
     def choose(self, name: str) -> None:

@@ -210,9 +210,11 @@ class Field(Element):
             self.box.on("input", self._take, js_handler="(event) => emit(event.target.value)")
             if on_change is not None:
                 self.box.on("change", on_change)
+                # Emptying it by its own button, or Enter without another text, is no change.
+                self.box.on("search", on_change)
 
     def _take(self, event: Any) -> None:
-        self.value = str(event.args)
+        self.value = event.args if isinstance(event.args, str) else ""
 
     def set(self, value: str) -> None:
         """Write something into it."""
@@ -246,7 +248,7 @@ class Select(Element):
         self.show(options, value)
 
     def _take(self, event: Any) -> Any:
-        self.value = str(event.args)
+        self.value = event.args if isinstance(event.args, str) else ""
         return None if self._on_change is None else self._on_change(self.value)
 
     def show(self, options: Sequence[tuple[str, str]], value: str) -> None:

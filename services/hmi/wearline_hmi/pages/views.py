@@ -96,7 +96,7 @@ def renew_surface(page: Frame, surface: Surface, note: ui.label) -> None:
     def renew(state: CellState, now_s: float) -> None:
         if state.view is None or state.view_at_s is None:
             return
-        surface.show(view_header(state.view), state.view)
+        surface.show(view_header(state.view))
         note.set_text(age_text(now_s - state.view_at_s, say))
 
     page.renewed_by(renew)

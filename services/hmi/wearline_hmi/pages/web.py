@@ -21,9 +21,13 @@ from wearline_hmi.pages.camera import build_camera
 from wearline_hmi.pages.frame import Site
 from wearline_hmi.pages.gate import Doorkeeper, Gate, add_gate
 from wearline_hmi.pages.live import add_live
+from wearline_hmi.pages.log import add_log_export, build_log
 from wearline_hmi.pages.measurement import build_measurement
 from wearline_hmi.pages.overview import build_overview
+from wearline_hmi.pages.production import add_export, build_production
+from wearline_hmi.pages.settings import build_settings
 from wearline_hmi.pages.shield import Shield
+from wearline_hmi.pages.users import build_users
 from wearline_hmi.service import HmiService
 
 LOG = logging.getLogger(__name__)
@@ -131,6 +135,12 @@ def make_app(service: HmiService, keeper: Doorkeeper) -> FastAPI:
     site.add("/", "Overview", rights.LOOK_AT_MEASURING, build_overview)
     site.add("/camera", "Camera", rights.LOOK_AT_CAMERA, build_camera)
     site.add("/measurement", "Measurement", rights.LOOK_AT_MEASURING, build_measurement)
+    site.add("/production", "Production", rights.LOOK_AT_PRODUCTION, build_production)
+    site.add("/log", "Log", rights.LOOK_AT_LOG, build_log)
+    site.add("/settings", "Settings", rights.LOOK_AT_SETTINGS, build_settings)
+    site.add("/users", "Users", rights.LOOK_AT_USERS, build_users)
+    add_export(app, site)
+    add_log_export(app, site)
     run.process_pool_start_method = "spawn"
     core.sio.eio.cors_allowed_origins = []
     ui.run_with(
