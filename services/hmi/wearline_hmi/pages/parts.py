@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -195,33 +196,36 @@ _numbers = itertools.count(1)
 class Field(Element):
     """A labelled input; `value` follows what is typed."""
 
-    def __init__(self, label: str, value: str = "", kind: str = "text", on_change: Callable[..., Any] | None = None,
-                 complete: str = "off", **props: Any) -> None:  # fmt: skip
+    def __init__(
+        self,
+        label: str,
+        kind: str = "text",
+        on_change: Callable[..., Any] | None = None,
+        complete: str = "off",
+        **props: Any,
+    ) -> None:
         super().__init__("div")
         self.classes("field")
-        self.value = value
-        name = f"field-{next(_numbers)}"
+        self.value = ""
+        self._name = name = f"field-{next(_numbers)}"
         with self:
             text_element("label", label)._props["for"] = name
             self.box = Element("input")
-            self.box._props.update(
-                {"id": name, "type": kind, "value": value, "autocomplete": complete, "maxlength": 300, **props}
-            )
-            self.box.on("input", self._take, js_handler="(event) => emit(event.target.value)")
+            # Without a `value`: Vue would write it over what somebody types, whenever anything is drawn anew.
+            self.box._props.update({"id": name, "type": kind, "autocomplete": complete, "maxlength": 300, **props})
+            self.box.on("input", self._take, js_handler="(event) => emit({value: event.target.value})")
             if on_change is not None:
                 self.box.on("change", on_change)
                 # Emptying it by its own button, or Enter without another text, is no change.
                 self.box.on("search", on_change)
 
     def _take(self, event: Any) -> None:
-        self.value = event.args if isinstance(event.args, str) else ""
+        self.value = str(event.args["value"])
 
     def set(self, value: str) -> None:
         """Write something into it."""
         self.value = value
-        self.box._props["value"] = value
-        self.box.run_method("setAttribute", "value", value)
-        self.box.update()
+        self.client.run_javascript(f"document.getElementById('{self._name}').value = {json.dumps(value)}")
 
 
 class Select(Element):
@@ -244,11 +248,13 @@ class Select(Element):
             text_element("label", label)._props["for"] = name
             self.box = Element("select")
             self.box._props["id"] = name
-            self.box.on("change", self._take, js_handler="(event) => emit(event.target.value)")
+            self.box.on("change", self._take, js_handler="(event) => emit({value: event.target.value})")
         self.show(options, value)
 
     def _take(self, event: Any) -> Any:
-        self.value = event.args if isinstance(event.args, str) else ""
+        self.value = str(event.args["value"])
+        self.box._props["value"] = self.value
+        self.box.update()
         return None if self._on_change is None else self._on_change(self.value)
 
     def show(self, options: Sequence[tuple[str, str]], value: str) -> None:
