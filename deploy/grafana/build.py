@@ -89,7 +89,7 @@ ROWS: tuple[tuple[str, int, tuple[Panel, ...]], ...] = (
             ),
             Panel(
                 "Alarm level", ((f"wearline_alarm_level{CELL}", "object {{object}}, zone {{zone}}"),), "none", 12,
-                "stat", "0 nothing, 1 look, 2 act.", ((None, GREEN), (1, YELLOW), (2, RED)),
+                "stat", "0 nothing, 1 info, 2 warning, 3 action, 4 stop.", ((None, GREEN), (2, YELLOW), (3, RED)),
             ),
             Panel(
                 "Strokes since the die was serviced",
