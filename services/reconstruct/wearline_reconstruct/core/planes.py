@@ -143,14 +143,10 @@ def _anchor(
             )  # fmt: skip
         return None, int(seen[0])
     for spot in find_spots(strip, scale):
-        near = (np.abs(found.peaks.along - spot.along_px) < scale.pitch_px) & (number[found.label] != _NONE)
-        if not near.any():
+        best = _line_at(found, number, spot, 5.0 * scale.pitch_px)
+        if best is None or best[1] > 0.35 * scale.pitch_px:
             continue
-        distance = np.abs(found.peaks.across_px[near] - spot.across_px)
-        best = int(np.argmin(distance))
-        if distance[best] > 0.3 * scale.pitch_px:
-            continue
-        origin = int(number[found.label[near][best]]) - lines // 2
+        origin = best[0] - lines // 2
         if len(seen) and (seen[0] - origin < 0 or seen[-1] - origin >= lines):
             continue
         return spot, origin
@@ -158,3 +154,21 @@ def _anchor(
         "shows no centre spot that fits the lines", where,
         "the spot of the middle line must be on the plate and not be covered; check --lines and --orientation",
     )  # fmt: skip
+
+
+def _line_at(found: Fragments, number: I64, spot: Spot, reach_px: float) -> tuple[int, float] | None:
+    """Number of the line that passes nearest to the spot, by straight lines fitted about it, and its distance [px]."""
+    near = np.flatnonzero((np.abs(found.peaks.along - spot.along_px) < reach_px) & (number[found.label] != _NONE))
+    named = number[found.label[near]]
+    distances = {}
+    for name in np.unique(named):
+        mine = near[named == name]
+        along = found.peaks.along[mine] - spot.along_px
+        if len(mine) < 10 or np.ptp(along) < 0.5 * reach_px:
+            continue
+        fit = np.polyfit(along, found.peaks.across_px[mine].astype(np.float64), 1)
+        distances[int(name)] = abs(float(fit[1]) - spot.across_px)
+    if not distances:
+        return None
+    best = min(distances, key=lambda name: distances[name])
+    return best, distances[best]

@@ -55,7 +55,7 @@ def _candidates(strip: Image, pitch: float, search: Search | None, most: int) ->
     period = max(round(unit), 1)
     length = max(round(max(0.35 * unit, 3.0)), 1)
     light = cv2.blur(small, (period, length), borderType=cv2.BORDER_REFLECT_101)
-    size = round(2.6 * unit) | 1
+    size = round(4.5 * unit) | 1
     opened = cv2.morphologyEx(light, cv2.MORPH_OPEN, np.ones((size, size), np.uint8), borderType=cv2.BORDER_REPLICATE)
     excess = light - cv2.blur(opened, (period, period))
     ambient = cv2.erode(small, np.ones((1, period | 1), np.uint8))
@@ -80,10 +80,32 @@ def _candidates(strip: Image, pitch: float, search: Search | None, most: int) ->
         _, value, _, (across, along) = cv2.minMaxLoc(excess, allowed)
         if value < least:
             break
-        found.append(_located(strip, pitch, (along + 0.5) * _SHRINK, (across + 0.5) * _SHRINK, value / line_light))
-        reach = round(unit) + 1
+        place, radius = _blob(excess, along, across, round(4.0 * unit))
+        at, over = ((v + 0.5) * _SHRINK for v in place)
+        # A spot broader than the pitch drowns its own line: nothing sharper is to be had than its middle.
+        if radius > 0.75 * unit:
+            found.append(Spot(at, over, value / line_light))
+        else:
+            found.append(_located(strip, pitch, at, over, value / line_light))
+        reach = round(max(unit, 2.0 * radius)) + 1
         allowed[max(along - reach, 0) : along + reach + 1, max(across - reach, 0) : across + reach + 1] = 0
     return found
+
+
+def _blob(excess: Image, along: int, across: int, reach: int) -> tuple[tuple[float, float], float]:
+    """Centroid (along, across) of what is above half of a top, and the radius of a disc of that size."""
+    a0, c0 = max(along - reach, 0), max(across - reach, 0)
+    window = excess[a0 : along + reach + 1, c0 : across + reach + 1]
+    half = 0.5 * float(excess[along, across])
+    _, label = cv2.connectedComponents((window > half).astype(np.uint8), connectivity=4)
+    mine = label == label[along - a0, across - c0]
+    weight = np.where(mine, window - half, 0.0).astype(np.float64)
+    total = max(float(weight.sum()), 1e-9)
+    centre = (
+        a0 + float(weight.sum(axis=1) @ np.arange(weight.shape[0])) / total,
+        c0 + float(weight.sum(axis=0) @ np.arange(weight.shape[1])) / total,
+    )
+    return centre, float(np.sqrt(mine.sum() / np.pi))
 
 
 _MARGIN_PITCHES = 6.0
