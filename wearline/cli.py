@@ -182,9 +182,21 @@ def _parser(wanted: str | None) -> ArgumentParser:
     return parser
 
 
+def _joined(given: Sequence[str]) -> list[str]:
+    """``--option -2=X`` as ``--option=-2=X``: argparse takes a value that starts with a minus for an option."""
+    joined: list[str] = []
+    for word in given:
+        is_negative = word[:1] == "-" and word[1:2].isdigit()
+        if is_negative and joined and joined[-1].startswith("--") and len(joined[-1]) > 2 and "=" not in joined[-1]:
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
-    given = list(sys.argv[1:] if argv is None else argv)
+    given = _joined(sys.argv[1:] if argv is None else argv)
     try:
         wanted = given[0] if given and not given[0].startswith("-") else None
         arguments = _parser(wanted).parse_args(given)

@@ -171,6 +171,19 @@ def test_calibration_refuses_what_cannot_be() -> None:
     assert "black.png" in refusal([*shots([(0.0, plate(0.0))]), black])
 
 
+def test_one_wrong_plate_of_five_is_found_and_its_height_not_used() -> None:
+    pictures = shots([(z, plate(z + (0.08 if z == 4.0 else 0.0))) for z in (0.0, 2.0, 4.0, 6.0, 8.0)])
+    calibration = calibrated(pictures, COMB.lines, False)
+    planes = {plane["z_mm"]: plane for plane in calibration.meta["planes"]}
+    assert [z for z, plane in planes.items() if not plane["is_believed"]] == [4.0]
+    assert planes[4.0]["left_out_mm"] == pytest.approx(0.08, abs=0.01)
+    across = COMB.at_datum() + 4.0 / (COMB.a_mm_per_px - COMB.b_per_px * 4.0)
+    line, along = np.nonzero(np.isfinite(across))
+    assert float(np.nanmean(heights(calibration, line, along, across[line, along]))) == pytest.approx(4.0, abs=0.006)
+    rests = [line["rest_mm"] for line in calibration.meta["lines"]]
+    assert len(rests) == COMB.lines and all(0.0 < rest < 0.05 for rest in rests)
+
+
 def test_calibration_survives_a_scratch_on_one_plate() -> None:
     def scratched(across: F64, along: F64) -> F64:
         return np.where((along > 200) & (along < 240), 2.4, 3.0)

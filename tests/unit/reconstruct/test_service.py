@@ -299,11 +299,64 @@ def test_unusable_options_give_one_line_and_exit_2(
     assert not (folder / "D.npz").exists()
 
 
-def test_lateral_scale_comes_from_a_chessboard(folder: Path, tmp_path: Path) -> None:
-    board = np.kron(np.indices((8, 10)).sum(axis=0) % 2, np.ones((40, 40))) * 180 + 40
-    picture = cv2.GaussianBlur(np.pad(board, 60, constant_values=220).astype(np.uint8), (5, 5), 1.0)
-    cv2.imwrite(str(tmp_path / "board.png"), picture)
+def test_lateral_scale_comes_from_a_target(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2.imwrite(str(tmp_path / "board.png"), drawn_target("chessboard"))
     planes = [f"--plane={z:g}={folder / f'P{z:g}.png'}" for z in (0.0, 3.0, 6.0)]
-    target = ["--target", str(tmp_path / "board.png"), "--square-mm", "5"]
+    target = ["--target", str(tmp_path / "board.png"), "--square-mm", "5", "--report", str(tmp_path / "report.txt")]
     assert main(["calibrate", *planes, "--lines", "11", *target, "--out", str(tmp_path / "C.npz")]) == 0
-    assert Calibration.load(tmp_path / "C.npz").mm_per_pixel == pytest.approx(0.125, rel=0.002)
+    assert Calibration.load(tmp_path / "C.npz").mm_per_pixel == pytest.approx(FIELD_MM / 40.0, rel=0.001)
+    report = (tmp_path / "report.txt").read_text()
+    assert report in capsys.readouterr().out
+    for word in ("chessboard, 11 x 7 corners", "off what the other planes predict", "accepted"):
+        assert word in report
+    frame = [str(folder / "part.png"), "--calibration", str(tmp_path / "C.npz"), "--out", str(tmp_path)]
+    assert main(["reconstruct", *frame]) == 0
+    with np.load(tmp_path / "part.npz") as found:
+        step = np.polyfit(found["col_px"], found["x_mm"], 1)
+        # Points 2 mm above the datum lie nearer, so that a pixel covers less.
+        assert float(step[0]) == pytest.approx(FIELD_MM / 40.0, rel=0.01)
+        assert float(np.median(found["x_mm"])) == pytest.approx(0.0, abs=0.5)
+
+
+def test_a_target_of_another_camera_is_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    planes = [f"--plane={z:g}={folder / f'P{z:g}.png'}" for z in (0.0, 3.0, 6.0)]
+    for name, picture, word in (
+        ("small.png", drawn_target("dots")[:400], "400"),
+        ("blank.png", np.full((480, 640), 90, np.uint8), "chessboard"),
+    ):
+        cv2.imwrite(str(tmp_path / name), picture)
+        target = ["--target", str(tmp_path / name), "--square-mm", "5"]
+        assert main(["calibrate", *planes, "--lines", "11", *target, "--out", str(tmp_path / "D.npz")]) == 2
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 1 and word in lines[0] and name in lines[0]
+    assert not (tmp_path / "D.npz").exists()
+
+
+def test_a_height_may_be_negative(folder: Path, tmp_path: Path) -> None:
+    planes = [
+        word
+        for z, name in ((-3.0, "P0"), (0.0, "P3"), (3.0, "P6"))
+        for word in ("--plane", f"{z:g}={folder / name}.png")
+    ]
+    assert main(["calibrate", *planes, "--lines", "11", "--out", str(tmp_path / "C.npz")]) == 0
+    assert Calibration.load(tmp_path / "C.npz").meta["planes_mm"] == [-3.0, 0.0, 3.0]
+
+
+FIELD_MM = 5.0
+
+
+def drawn_target(kind: str, size: tuple[int, int] = (480, 640), field_px: float = 40.0) -> np.ndarray:
+    """A target square on, 12 x 8 fields of ``field_px``, with a bright rim."""
+    y, x = (np.mgrid[0 : size[0] * 4, 0 : size[1] * 4] + 0.5) / 4.0 - 0.5
+    u, v = (x - 80.0) / field_px, (y - 80.0) / field_px
+    inside = (u > 0) & (u < 12) & (v > 0) & (v < 8)
+    if kind == "chessboard":
+        bright = (np.floor(u) + np.floor(v)) % 2 == 0
+    else:
+        bright = np.hypot(u % 1.0 - 0.5, v % 1.0 - 0.5) > 0.25
+    fine = np.where(bright | ~inside, 220.0, 40.0).astype(np.float32)
+    return np.asarray(
+        cv2.GaussianBlur(cv2.resize(fine, size[::-1], interpolation=cv2.INTER_AREA), (5, 5), 1.0), np.uint8
+    )

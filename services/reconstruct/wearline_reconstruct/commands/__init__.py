@@ -7,6 +7,7 @@ import sys
 import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,9 @@ from wearline.offline import Chain, read_frame
 from wearline.recipe import Recipe, load_recipe
 from wearline.surface import dense_map
 from wearline_reconstruct.config import ReconstructSettings
-from wearline_reconstruct.core.calibration import Shot, calibrate
+from wearline_reconstruct.core.calibration import CalibrationSettings, Shot, calibrate
 from wearline_reconstruct.core.chain import prepare
+from wearline_reconstruct.core.lateral import Target, distance_mm, find_target, fit_lateral, positions_mm, scale_of
 from wearline_reconstruct.core.lines import Fragments, fragments
 from wearline_reconstruct.core.stripes import estimate_scale, strip_image, stripe_peaks
 from wearline_reconstruct.drivers.pictures import read_picture
@@ -37,8 +39,16 @@ def _configure_calibrate(parser: ArgumentParser) -> None:
     parser.add_argument("--lines", type=int, default=25, help="lines that the laser projects (default 25)")
     scale = parser.add_mutually_exclusive_group()
     scale.add_argument("--mm-per-pixel", type=float, metavar="S", help="lateral scale on the plane z = 0 [mm/px]")
-    scale.add_argument("--target", type=Path, metavar="BOARD.png", help="picture of a chessboard on the plane z = 0")
-    parser.add_argument("--square-mm", type=float, metavar="MM", help="edge of one field of the chessboard [mm]")
+    scale.add_argument(
+        "--target", type=Path, metavar="BOARD.png", help="picture of a chessboard or a grid of dots on the plane z = 0"
+    )
+    parser.add_argument(
+        "--square-mm",
+        type=float,
+        metavar="MM",
+        help="edge of one field of the chessboard, or distance of the dots [mm]",
+    )
+    parser.add_argument("--report", type=Path, metavar="FILE.txt", help="write the report there, too")
     parser.add_argument("--orientation", choices=("horizontal", "vertical"), default="horizontal")
     parser.add_argument("--out", type=Path, required=True, metavar="C.npz")
 
@@ -53,19 +63,27 @@ def _run_calibrate(arguments: Namespace) -> int:
     if len({height for height, _ in planes}) < 2:
         raise UsageError("needs plates at two heights at least", "--plane", "give --plane HEIGHT=FILE for each")
     _check_writable(arguments.out)
-    scale = arguments.mm_per_pixel
+    if arguments.report is not None:
+        _check_writable(arguments.report, "--report")
+    target = None
     if arguments.target is not None:
-        scale = _target_scale(arguments.target, arguments.square_mm)
+        target = _target(arguments.target, arguments.square_mm)
     elif arguments.square_mm is not None:
-        raise UsageError("goes with --target", "--square-mm", "name the picture of the chessboard")
+        raise UsageError("goes with --target", "--square-mm", "name the picture of the target")
     settings = ReconstructSettings()
     shots = [Shot(height, read_frame(path), str(path)) for height, path in progress(planes, "read")]
     calibration = calibrate(
-        shots, lines=arguments.lines, is_vertical=arguments.orientation == "vertical", mm_per_pixel=scale,
+        shots, lines=arguments.lines, is_vertical=arguments.orientation == "vertical",
+        mm_per_pixel=arguments.mm_per_pixel,
         settings=settings.calibration, stripes=settings.stripes, line_settings=settings.lines,
     )  # fmt: skip
+    if target is not None:
+        calibration = _with_lateral(calibration, target, arguments.square_mm, arguments.target)
     name = calibration.save(arguments.out)
-    _report(calibration, arguments.out, name)
+    report = "\n".join(_report(calibration, arguments.out, name, settings.calibration))
+    print(report)
+    if arguments.report is not None:
+        arguments.report.write_text(report + "\n", encoding="utf-8")
     return 0
 
 
@@ -80,49 +98,76 @@ def _plane(text: str) -> tuple[float, Path]:
     return value, Path(path)
 
 
-def _check_writable(path: Path) -> None:
+def _check_writable(path: Path, option: str = "--out") -> None:
     if path.is_dir() or not path.parent.is_dir():
         raise UsageError(
-            "is a folder" if path.is_dir() else "lies in no folder", f"--out {path}", "name a file to write"
+            "is a folder" if path.is_dir() else "lies in no folder", f"{option} {path}", "name a file to write"
         )
 
 
-def _target_scale(path: Path, square_mm: float | None) -> float:
-    """mm per pixel about the middle of a chessboard.
-
-    Raises:
-        UsageError: the size of the fields is missing.
-        CalibrationError: there is no chessboard.
-    """
-    if square_mm is None or square_mm <= 0.0:
-        raise UsageError("needs the size of the chessboard's fields", "--target", "add --square-mm MM")
-    picture = read_picture(path)
+def _target(path: Path, field_mm: float | None) -> tuple[Target, tuple[int, int]]:
+    """The target in a picture, and the picture's size."""
+    if field_mm is None or not 0.0 < field_mm < 1000.0:
+        raise UsageError("needs the size of its fields", "--target", "add --square-mm MM")
+    try:
+        picture = read_picture(path)
+    except FrameError as error:
+        raise CalibrationError(error.what, error.where, error.cure) from error
     grey = picture if picture.dtype == np.uint8 else np.clip(picture, 0, 255).astype(np.uint8)
-    found, corners, meta = cv2.findChessboardCornersSBWithMeta(
-        grey, (3, 3), cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
-    )
-    if not found or meta is None:
-        raise CalibrationError("shows no chessboard", str(path), "show all of it, flat on z = 0, sharp, laser off")
-    grid = corners.reshape(meta.shape[0], meta.shape[1], 2)
-    steps = np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=2).reshape(-1) for axis in (0, 1)])
-    return float(square_mm / np.median(steps))
+    return find_target(np.asarray(grey, np.uint8), str(path)), (int(grey.shape[0]), int(grey.shape[1]))
 
 
-def _report(calibration: Calibration, path: Path, name: str) -> None:
+def _with_lateral(
+    calibration: Calibration, found: tuple[Target, tuple[int, int]], field_mm: float, path: Path
+) -> Calibration:
+    target, shape = found
+    rows, cols = (int(v) for v in calibration.image_shape)
+    if shape != (rows, cols):
+        raise CalibrationError(
+            f"is {shape[1]} x {shape[0]} pixels, the plates are {cols} x {rows}", str(path),
+            "take the target with the same camera",
+        )  # fmt: skip
+    lateral = fit_lateral(target, field_mm, shape, distance_mm(calibration), str(path))
+    return replace(
+        calibration, mm_per_pixel=scale_of(lateral, shape), meta={**calibration.meta, "lateral": lateral}
+    )  # fmt: skip
+
+
+def _report(calibration: Calibration, path: Path, name: str, limits: CalibrationSettings) -> list[str]:
     low, high = calibration.z_range_mm
+    meta = calibration.meta
     covered = np.isfinite(calibration.across0_px).mean()
-    print(f"{path}: {name[:12]}, {calibration.lines} lines, {covered:.0%} covered")
-    for shot in calibration.meta["shots"]:
-        print(
-            f"  {shot['z_mm']:8.3f} mm  {shot['where']}: {shot['lines']} lines,"
-            f" offset {1e3 * shot['offset_mm']:+.1f} um,"
-            f" rest {1e3 * shot['rms_mm']:.1f} um per point"
-        )
-    print(
-        f"  heights {low:.2f} to {high:.2f} mm, {1e3 * abs(calibration.meta['mm_per_line_px']):.1f} um per px of line"
-        f" shift, calibration uncertainty {1e3 * float(np.nanmedian(calibration.z_sigma_mm)):.1f} um,"
-        f" vibration {calibration.meta['vibration_px']:.3f} px"
+    rests = [line["rest_mm"] for line in meta["lines"] if line["rest_mm"] is not None]
+    text = [f"{path}: {name[:12]}, {calibration.lines} lines, {covered:.0%} covered"]
+    text += [
+        f"  {shot['z_mm']:8.3f} mm  {shot['where']}: {shot['lines']} lines, offset {1e3 * shot['offset_mm']:+.1f} um,"
+        f" rest {1e3 * shot['rms_mm']:.1f} um per point"
+        for shot in meta["shots"]
+    ]
+    text += [
+        f"  plane {plane['z_mm']:g} mm lies {1e3 * plane['left_out_mm']:+.1f} um off what the other planes predict"
+        f" (expected within {2e3 * plane['sigma_mm']:.0f} um of 0)"
+        + ("" if plane["is_believed"] else ": WARNING, its height was not used; check the height that was entered")
+        for plane in meta["planes"]
+    ]
+    worst = max(meta["lines"], key=lambda line: line["rest_mm"] or 0.0)
+    missing = [str(line["line"]) for line in meta["lines"] if line["covered"] < 0.5]
+    text.append(
+        f"  lines: rest {1e3 * float(np.median(rests)):.1f} um, worst {1e3 * worst['rest_mm']:.1f} um"
+        f" (line {worst['line']}, limit {1e3 * limits.largest_line_rest_mm:.0f} um)"
+        + (f"; less than half seen of {', '.join(missing)}" if missing else "")
     )
+    text.append(
+        f"  heights {low:.2f} to {high:.2f} mm, {1e3 * abs(meta['mm_per_line_px']):.1f} um per px of line"
+        f" shift, calibration uncertainty {1e3 * float(np.nanmedian(calibration.z_sigma_mm)):.1f} um,"
+        f" vibration {meta['vibration_px']:.3f} px"
+    )
+    if np.isfinite(calibration.mm_per_pixel):
+        lateral = meta.get("lateral")
+        told = f", {lateral['target']}, rest {lateral['rms_px']:.2f} px" if lateral else ""
+        text.append(f"  lateral scale {calibration.mm_per_pixel:.5f} mm/px{told}")
+    text.append("  accepted")
+    return text
 
 
 def _configure_reconstruct(parser: ArgumentParser) -> None:
@@ -202,11 +247,13 @@ def _save_heights(path: Path, found: LinePoints, calibration: Calibration, recip
     )
     timings = {"decode": round(decode_ms, 3), **found.timings_ms, "map": round(1e3 * (time.perf_counter() - start), 3)}
     points = found.points
+    x_mm, y_mm = positions_mm(calibration, *(points[:, k].astype(np.float64) for k in (1, 2, 3)))
     np.savez_compressed(
         path, line=points[:, 0].astype(np.int16), row_px=points[:, 1], col_px=points[:, 2], z_mm=points[:, 3],
         sigma_mm=points[:, 4], sigma_frame_mm=np.float64(found.sigma_frame_mm), z_map_mm=surface.z_mm,
         sigma_map_mm=surface.sigma_mm, roi=surface.roi, coverage=np.float64(found.coverage),
         timings_ms=np.array(json.dumps(timings)),
+        x_mm=x_mm.astype(np.float32), y_mm=y_mm.astype(np.float32),
     )  # fmt: skip
 
 

@@ -40,6 +40,11 @@ class CalibrationSettings(Settings):
     """Expected shift of a whole frame; the shots refine it. [px]"""
     largest_plate_error_mm: float = 0.15
     """A plate further off the others than this is refused. [mm]"""
+    doubted_plate_error_mm: float = 0.03
+    """One plate of four or more that is further off than this, and clearly more than the others, counts for the shape
+    of the lines, not with its height. [mm]"""
+    largest_line_rest_mm: float = 0.1
+    """A line whose points scatter more than this about flat plates is refused. [mm]"""
     least_shift_px: float = 3.0
     """The lines must move at least this far between the lowest and the highest plate. [px]"""
     margin_share: float = 0.25
@@ -122,9 +127,16 @@ def calibrate(
     along_size = pictures[0].across_px.shape[1]
     centre = np.asarray(np.arange(rows.shape[2]) * _BLOCK + 0.5 * (_BLOCK - 1), np.float64)
     u = _unit(centre, along_size)
-    solution = _solve(heights, rows, sigma, u, settings.vibration_px, len(planes))
-    _check_fit(heights, planes, solution, shots, settings)
-    return _assemble(shots, pictures, heights, rows, solution, along_size, lines, is_vertical, mm_per_pixel, settings)
+    priors = np.full(len(shots), settings.vibration_px)
+    solution = _solve(heights, rows, sigma, u, priors)
+    doubted = _doubted(heights, solution, settings)
+    if doubted is not None:
+        priors[heights == doubted] = _FREE_PX
+        solution = _solve(heights, rows, sigma, u, priors)
+    _check_fit(heights, planes, solution, shots, settings, doubted)
+    return _assemble(
+        shots, pictures, heights, rows, solution, along_size, lines, is_vertical, mm_per_pixel, settings, doubted
+    )
 
 
 def _unit(along: F64, size: int) -> F64:
@@ -195,8 +207,15 @@ def _blocks(pictures: Sequence[PlaneLines]) -> tuple[F64, F64]:
     return np.stack(rows), np.stack(sigmas)
 
 
-def _solve(heights: F64, rows: F64, sigma: F64, u: F64, vibration_px: float, planes: int) -> _Solution:
-    """Gauss-Newton over all lines at once; unknowns: per line x1 and g terms, then b, then one offset per shot."""
+_FREE_PX = 1e3
+"""Prior of the offset of a shot whose height is not believed. [px]"""
+
+
+def _solve(heights: F64, rows: F64, sigma: F64, u: F64, prior_px: F64) -> _Solution:
+    """Gauss-Newton over all lines at once; unknowns: per line x1 and g terms, then b, then one offset per shot.
+
+    ``prior_px`` is the standard deviation that each shot's offset may have.
+    """
     shots, lines, blocks = rows.shape
     terms, shared = _X1_TERMS + _G_TERMS, 1 + shots
     bx = _terms(u, _X1_TERMS)
@@ -229,8 +248,8 @@ def _solve(heights: F64, rows: F64, sigma: F64, u: F64, vibration_px: float, pla
         normal[own, own] = 1.0 / (_DISTANCE_SPREAD * b_prior) ** 2
         right[own] = (b_prior - b) * normal[own, own]
         tail = np.arange(own + 1, size)
-        normal[tail, tail] = 1.0 / vibration_px**2
-        right[tail] = -offset / vibration_px**2
+        normal[tail, tail] = 1.0 / prior_px**2
+        right[tail] = -offset / prior_px**2
         values = np.concatenate([x1, g], axis=1)
         for term in range(terms):
             places = np.arange(lines) * terms + term
@@ -325,8 +344,9 @@ def _common_slope(heights: F64, rows: F64) -> float:
 
 
 def _check_fit(
-    heights: F64, planes: Sequence[float], solution: _Solution, shots: Sequence[Shot], settings: CalibrationSettings
-) -> None:
+    heights: F64, planes: Sequence[float], solution: _Solution, shots: Sequence[Shot], settings: CalibrationSettings,
+    doubted: float | None,
+) -> None:  # fmt: skip
     """A plate that does not fit the others has a wrong height, or is no plate."""
     a = 1.0 / float(np.median(solution.g[:, 0]))
     for k, shot in enumerate(shots):
@@ -336,24 +356,84 @@ def _check_fit(
                 f"is off a flat plate at {shot.z_mm:g} mm by {spread:.2f} mm here and there", shot.where,
                 "check that the plate is flat, lies flat, and its height is right",
             )  # fmt: skip
+    per_line = _line_rests(solution, a)
+    if float(np.nanmax(per_line)) > settings.largest_line_rest_mm:
+        line = int(np.nanargmax(per_line))
+        raise CalibrationError(
+            f"line {line} scatters by {per_line[line]:.2f} mm about flat plates", "calibration",
+            "check focus and exposure, and that nothing reflects the laser",
+        )  # fmt: skip
     if len(planes) < 3:
         return
-    error = []
-    for z in planes:
-        mine = heights == z
-        error.append(float(np.nanmedian(solution.residual[mine])) + float(np.mean(solution.offset[mine])))
-    worst = int(np.argmax(np.abs(error)))
-    if abs(error[worst] * a) > settings.largest_plate_error_mm:
-        name = shots[int(np.flatnonzero(heights == planes[worst])[0])].where
+    found = _left_out(heights, solution, settings.vibration_px, heights != doubted)
+    worst = max(found, key=lambda one: abs(one.error_mm))
+    if doubted is None:
+        # Where it is one plate, its neighbours look wrong as well; of three, the middle one says how much.
+        worst = min(found, key=lambda one: one.rest if len(found) > 3 else one.sigma_mm)
+    if abs(worst.error_mm) > settings.largest_plate_error_mm:
+        name = shots[int(np.flatnonzero(heights == worst.z_mm)[0])].where
         raise CalibrationError(
-            f"the plate at {planes[worst]:g} mm lies {error[worst] * a:+.2f} mm off the others", name,
+            f"the plate at {worst.z_mm:g} mm lies {worst.error_mm:+.2f} mm off the others", name,
             "check the height that was entered for it",
         )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _LeftOut:
+    """One plane beside what the others say of it."""
+
+    z_mm: float
+    error_mm: float
+    """Where it lies off their prediction, towards the camera. [mm]"""
+    sigma_mm: float
+    """Standard uncertainty of that by vibration. [mm]"""
+    rest: float
+    """How far the others are off their own fit: mean square in units of vibration."""
+
+
+def _left_out(heights: F64, solution: _Solution, vibration_px: float, believed: Any) -> list[_LeftOut]:
+    """Each plane left out in turn of a fit through the mean places of all lines.
+
+    The mean place moves by x0 + g h + b g^2 h^2 (equation 4-6 expanded; the next term is far below a
+    micrometre's worth); the last coefficient has its prior from where cameras stand.
+    """
+    slope = float(np.median(solution.g[np.any(solution.g != 0.0, axis=1), 0]))
+    bend = slope / _DISTANCE_MM
+    place = heights * slope / (1.0 - solution.b * slope * heights) + solution.offset
+    place = place + np.nanmedian(solution.residual, axis=(1, 2))
+    basis = np.stack([np.ones_like(heights), heights, heights**2], axis=1)
+    prior = np.diag([0.0, 0.0, (vibration_px / (_DISTANCE_SPREAD * bend)) ** 2])
+    found = []
+    for z in np.unique(heights):
+        mine = heights == z
+        used = ~mine & believed
+        if len(np.unique(heights[used])) < 2:
+            continue
+        normal = basis[used].T @ basis[used] + prior
+        inverse = np.linalg.inv(normal)
+        fit = inverse @ (basis[used].T @ place[used] + prior @ np.array([0.0, 0.0, bend]))
+        error = float(np.mean(place[mine] - basis[mine] @ fit)) / slope
+        leverage = float(basis[mine][0] @ inverse @ basis[mine][0])
+        sigma = vibration_px * float(np.sqrt(1.0 / mine.sum() + leverage)) / abs(slope)
+        rest = float(np.mean((place[used] - basis[used] @ fit) ** 2)) / vibration_px**2
+        found.append(_LeftOut(float(z), error, sigma, rest))
+    return found
+
+
+def _doubted(heights: F64, solution: _Solution, settings: CalibrationSettings) -> float | None:
+    """Height of the one plane that contradicts all others, which agree; None = there is none."""
+    if len(np.unique(heights)) < 4:
+        return None
+    every = np.ones(len(heights), bool)
+    best = min(_left_out(heights, solution, settings.vibration_px, every), key=lambda one: one.rest)
+    is_off = abs(best.error_mm) > max(settings.doubted_plate_error_mm, 4.0 * best.sigma_mm)
+    return best.z_mm if is_off and best.rest < 4.0 else None
 
 
 def _assemble(
     shots: Sequence[Shot], pictures: Sequence[PlaneLines], heights: F64, rows: F64, solution: _Solution,
     along_size: int, lines: int, is_vertical: bool, mm_per_pixel: float | None, settings: CalibrationSettings,
+    doubted: float | None,
 ) -> Calibration:  # fmt: skip
     along = np.arange(along_size, dtype=np.float64)
     u = _unit(along, along_size)
@@ -372,8 +452,9 @@ def _assemble(
     span = float(planes[-1] - planes[0])
     margin = settings.margin_share * span + settings.margin_mm
     z_range = np.array([planes[0] - margin, planes[-1] + margin])
-    vibration = _vibration(solution, heights, len(planes), settings.vibration_px)
-    common, own = _uncertainty(solution, heights, z_range, bx, bg, a, vibration)
+    believed = heights != doubted
+    vibration = _vibration(solution.offset[believed], heights[believed], settings.vibration_px)
+    common, own = _uncertainty(solution, heights[believed], z_range, bx, bg, a, vibration)
     scale_mm = float(mm_per_pixel) if mm_per_pixel else float("nan")
     widths = [p.scale.width_px for p in pictures]
     a_usual = float(np.nanmedian(a))
@@ -392,6 +473,23 @@ def _assemble(
     meta: dict[str, Any] = {
         "planes_mm": [float(z) for z in planes],
         "shots": residual,
+        "planes": [
+            {
+                "z_mm": one.z_mm,
+                "left_out_mm": round(one.error_mm, 5),
+                "sigma_mm": round(one.sigma_mm, 5),
+                "is_believed": one.z_mm != doubted,
+            }
+            for one in _left_out(heights, solution, settings.vibration_px, believed)
+        ],
+        "lines": [
+            {
+                "line": k,
+                "rest_mm": None if not np.isfinite(rest) else round(float(rest), 5),
+                "covered": round(float(known[k].mean()), 4),
+            }
+            for k, rest in enumerate(_line_rests(solution, a_usual))
+        ],
         "vibration_px": round(vibration, 5),
         "z_sigma_common_mm": round(common, 6),
         "pitch_px": round(float(np.median([p.scale.pitch_px for p in pictures])), 3),
@@ -408,6 +506,15 @@ def _assemble(
         meta=meta,
     )  # fmt: skip
     return _with_spot(draft, pictures, heights)
+
+
+def _line_rests(solution: _Solution, a_usual: float) -> F64:
+    """Robust spread of each line's points about flat plates; NaN = not seen. [mm]"""
+    rest = np.full(solution.residual.shape[1], np.nan)
+    for line, mine in enumerate(np.moveaxis(solution.residual, 1, 0)):
+        if np.isfinite(mine).any():
+            rest[line] = 1.4826 * float(np.nanmedian(np.abs(mine))) * abs(a_usual)
+    return rest
 
 
 def _unmodelled(solution: _Solution, along_size: int) -> F64:
@@ -449,11 +556,11 @@ def _covered(shown: Any) -> Any:
     return result
 
 
-def _vibration(solution: _Solution, heights: F64, planes: int, prior_px: float) -> float:
+def _vibration(offset: F64, heights: F64, prior_px: float) -> float:
     """Standard deviation of the shift of a whole frame: what the shots show, weighed with what is usual."""
-    freedom = max(len(heights) - min(planes, 3), 0)
+    freedom = max(len(heights) - min(len(np.unique(heights)), 3), 0)
     # The offsets are shrunk by their own prior and by what the heights absorb; the count of freedoms allows for that.
-    total = float((solution.offset**2).sum())
+    total = float((offset**2).sum())
     return float(np.sqrt((3.0 * prior_px**2 + total) / (3.0 + freedom)))
 
 
