@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from wearline_judge.core.alarms import AlarmSettings
 from wearline_judge.core.judgement import JudgingSettings
 from wearline_judge.drivers.frames import FrameSettings
 from wearline_judge.drivers.room import RoomSettings
@@ -16,6 +17,7 @@ class JudgeSettings(JudgingSettings, FrameSettings, RoomSettings):
     """``sqlite:///FILE`` or ``postgresql://USER:PASSWORD@HOST/DATABASE``; None = SQLite in the data folder."""
     records_kept: int | None = Field(default=None, ge=1)
     """Records beyond this many are pruned, the oldest first; a signed checkpoint stands for them. None = keep all."""
+    alarms: AlarmSettings = AlarmSettings()
     teach_frames: int = Field(default=5, ge=1, le=100)
     """Parts that make a template when the next ones are taught."""
     view_longest: int = Field(default=160, ge=16, le=1024)

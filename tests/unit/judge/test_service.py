@@ -23,9 +23,11 @@ from tests.unit.judge.parts import (
 from wearline.config import CellSettings
 from wearline.errors import BusError, RecordError
 from wearline.messages import (
+    Acknowledge,
     AskArtifact,
     AskRecipe,
     AskRecords,
+    AskWearMap,
     Decision,
     DieEvent,
     Event,
@@ -44,9 +46,10 @@ from wearline.messages import (
     View,
 )
 from wearline.metrics import REGISTRY
-from wearline.recipe import Limits, Recipe
+from wearline.recipe import Limits, Recipe, Zone
 from wearline.topics import JOURNAL, Query
 from wearline_judge.config import JudgeSettings
+from wearline_judge.core.alarms import AlarmLevel, AlarmSettings
 from wearline_judge.drivers.frames import pixel_hash
 from wearline_judge.drivers.records import Cycle, RecordStore
 from wearline_judge.drivers.references import StoredReferences
@@ -236,7 +239,7 @@ def test_an_own_fault_is_not_measured_and_never_passed(cell: Cell, monkeypatch: 
     def fail(*_: object) -> None:
         raise ZeroDivisionError("own fault")
 
-    monkeypatch.setattr("wearline_judge.service.judge_points", fail)
+    monkeypatch.setattr("wearline_judge.service.judge.judge_points", fail)
     found = cell.judged(Part())
     assert found.decision is Decision.NOT_MEASURED and "own fault" in found.reason and 10 <= found.code <= 99
 
@@ -424,6 +427,95 @@ def test_wear_rises_towards_the_limit_and_a_die_event_starts_anew(make: Callable
     assert 'wearline_strokes_since_service{cell="test",object="1"} 10.0' in text
     assert 'wearline_remaining_strokes{cell="test",object="1",quantile="0.5",zone="part"} NaN' in text
     assert 'wearline_wear_millimeters{cell="test",object="1",zone="part"} 0.1' in text
+
+
+ZONED = Recipe(
+    limits=Limits(max_error_mm=0.5),
+    zones=(
+        Zone(name="flaw", polygon_px=((260, 170), (400, 170), (400, 310), (260, 310)), limits=Limits(max_error_mm=0.3)),
+        Zone(name="rim", polygon_px=((450, 60), (600, 60), (600, 400), (450, 400))),
+    ),
+)
+
+
+def run(cell: Cell, strokes: range, flaw_mm: Callable[[int], float]) -> list[Event]:
+    """Whole cycles, and ticks until every trend is up to date."""
+    said: list[Event] = []
+    for stroke in strokes:
+        verdict = cell.judged(Part(flaw_mm=flaw_mm(stroke)), stroke)
+        list(cell.judge.on_outcome(outcome(stroke, verdict.code)))
+        for turn in range(3):
+            said += [m for m in cell.judge.tick(1000.0 + stroke + 0.1 * turn) if isinstance(m, Event)]
+    return said
+
+
+def test_every_zone_has_a_trend_with_its_own_limit(make: Callable[..., Cell]) -> None:
+    cell = make(recipe=ZONED)
+    run(cell, range(1, 21), lambda s: 0.08 + 0.008 * s)
+    part, flaw, rim = cell.records().trends
+    assert (part.zone, flaw.zone, rim.zone) == ("", "flaw", "rim")
+    assert (part.limit_mm, flaw.limit_mm, rim.limit_mm) == (0.5, 0.3, 0.05)
+    assert flaw.slope_mm_per_kilostroke == pytest.approx(7.8, rel=0.15)
+    assert flaw.remaining_p50 is not None and part.remaining_p50 is not None
+    assert flaw.remaining_p50 < part.remaining_p50
+    assert rim.wear_mm == 0.0 and rim.remaining_p50 is None
+
+
+def test_alarms_are_raised_held_acknowledged_and_remembered(make: Callable[..., Cell]) -> None:
+    cell = make(recipe=ZONED, settings=JudgeSettings(alarms=AlarmSettings(bad_in_row=3, strokes_to_stop=5)))
+    run(cell, range(1, 4), lambda _: 0.1)
+    assert [t.alarm_level for t in cell.records().trends] == [0, 0, 0]
+    said = run(cell, range(4, 8), lambda _: 0.6)
+    assert any("object 1: stop: 3 parts in a row were not good" in event.text for event in said)
+    part = cell.records().trends[0]
+    assert part.alarm_level == AlarmLevel.STOP and part.acknowledged_by == "" and part.alarm_stroke == 6
+    assert 'wearline_alarm_level{cell="test",object="1",zone="part"} 4.0' in generate_latest(REGISTRY).decode()
+    # Held though its cause has gone, also across a restart, until somebody takes notice.
+    run(cell, range(8, 10), lambda _: 0.1)
+    cell.restart()
+    assert cell.records().trends[0].alarm_level == AlarmLevel.STOP
+    asked = Acknowledge(object_index=1, user="ada", reason="insert was loose, mended")
+    assert not cell.judge.on_acknowledge(asked.replace(user="")).ok
+    assert cell.judge.on_acknowledge(asked).ok
+    assert not cell.judge.on_acknowledge(asked).ok
+    assert cell.records().trends[0].alarm_level < AlarmLevel.WARNING
+    # While its cause is there it stays, with the name of who knows of it.
+    run(cell, range(10, 14), lambda _: 0.6)
+    assert cell.judge.on_acknowledge(asked).ok
+    part = cell.records().trends[0]
+    assert part.alarm_level == AlarmLevel.STOP
+    assert (part.acknowledged_by, part.acknowledged_reason) == ("ada", "insert was loose, mended")
+    kinds = [entry.kind for entry in cell.stores.records.verified()]
+    assert kinds.count("acknowledgement") == 2
+
+
+def test_a_service_starts_trend_alarm_and_map_anew_but_another_coil_does_not(make: Callable[..., Cell]) -> None:
+    cell = make(recipe=ZONED)
+    run(cell, range(1, 12), lambda s: 0.1 + 0.01 * s)
+    assert cell.judge.on_wear_map(AskWearMap(object_index=1)).parts == 11
+    assert cell.judge.on_die_event(DieEvent(object_index=1, kind="coil_change")).ok
+    part = cell.records().trends[0]
+    assert len(part.points) == 11 and part.strokes_since_service == 10 and part.die_events == ((11, "coil_change"),)
+    assert cell.judge.on_die_event(DieEvent(object_index=1, kind="regrind")).ok
+    part = cell.records().trends[0]
+    assert part.points == () and part.strokes_since_service == 0 and part.alarm_level == 0
+    with pytest.raises(RecordError, match="no measured part"):
+        cell.judge.on_wear_map(AskWearMap(object_index=1))
+
+
+def test_the_wear_map_shows_where_errors_are_and_where_wear_grows(make: Callable[..., Cell]) -> None:
+    cell = make(recipe=ZONED)
+    run(cell, range(1, 13), lambda s: 0.1 + 0.01 * s)
+    found = cell.judge.on_wear_map(AskWearMap(object_index=1))
+    share, slope, sigma = found.maps
+    # FLAW lies about x 330, y 240.
+    at = ((240 - found.origin_px[1]) // found.square_px, (330 - found.origin_px[0]) // found.square_px)
+    far = ((400 - found.origin_px[1]) // found.square_px, (550 - found.origin_px[0]) // found.square_px)
+    assert share[at] == 1.0 and share[far] == 0.0
+    assert slope[at] == pytest.approx(10.0, rel=0.2) and abs(slope[far]) < 5.0 * sigma[far] + 0.5
+    cell.restart()
+    again = cell.judge.on_wear_map(AskWearMap(object_index=1))
+    assert np.array_equal(again.maps, found.maps, equal_nan=True) and again.parts == 12
 
 
 def test_it_answers_for_the_object_list_and_artifacts(cell: Cell) -> None:

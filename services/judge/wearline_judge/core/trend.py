@@ -29,6 +29,10 @@ class Trend:
     remaining_p10: float | None = None
     remaining_p50: float | None = None
     remaining_p90: float | None = None
+    wear_sigma_mm: float | None = None
+    """Standard uncertainty of wear_mm; None without a fit. [mm]"""
+    jumps: tuple[tuple[int, float], ...] = ()
+    """(stroke, size in mm) of sudden changes."""
 
 
 def wear_limit(recipe: Recipe, mean_errors: Sequence[float], wears: Sequence[float]) -> float:
@@ -82,4 +86,6 @@ def wear_trend(
         remaining_p10=found.remaining_p10,
         remaining_p50=found.remaining_p50,
         remaining_p90=found.remaining_p90,
+        wear_sigma_mm=found.level_sigma_mm,
+        jumps=tuple((jump.stroke, jump.size_mm) for jump in found.jumps),
     )

@@ -6,6 +6,7 @@ the tally and in the wear bins are one transaction.
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,6 +15,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import (
     Connection,
     Engine,
@@ -37,6 +40,7 @@ from wearline.messages import AskRecords, Decision, DieEvent, Outcome, RecordRow
 from wearline_judge.drivers.chain import FIRST, SIGNED_EVERY, ChainError, Checkpoint, Entry, checked, digest, signature
 from wearline_judge.drivers.schema import HEAD, migrate, version_of
 from wearline_judge.drivers.tables import (
+    ALARM,
     CHECKPOINT,
     DIE_EVENT,
     ENTRY,
@@ -45,6 +49,7 @@ from wearline_judge.drivers.tables import (
     RECORD,
     TALLY,
     WEAR_BIN,
+    WEAR_MAP,
     ZONE_FIGURE,
 )
 
@@ -56,6 +61,8 @@ _PRUNED = "pruned"
 """Mark: how many records were pruned."""
 _HEAD_CHECKED = 100
 """Newest entries that are checked whenever the records are opened."""
+_GOES_ON = "coil_change"
+"""The one die event after which the same surface wears on."""
 _AT_ONCE = 500
 """Cycle ids in one question; databases bound the number of parameters."""
 _SEARCHED = 400_000
@@ -125,6 +132,28 @@ class Cycle:
     def _outcome(self) -> Outcome:
         assert self.outcome is not None
         return self.outcome
+
+
+@dataclass(frozen=True)
+class StoredAlarm:
+    """Alarm of one zone; see the table ``alarm``."""
+
+    zone: str
+    level: int
+    stroke: int
+    reason: str
+    person: str
+    utc: str
+    note: str
+
+
+@dataclass(frozen=True)
+class StoredMap:
+    """Running sums of a wear map."""
+
+    square_px: int
+    origin_px: tuple[int, int]
+    arrays: dict[str, NDArray[np.float64]]
 
 
 class _Draft:
@@ -215,6 +244,8 @@ class RecordStore:
             WEAR_BIN, {"count": "sum", "wear_sum_mm": "sum", "wear_max_mm": "max", "last_stroke": "new"}
         )
         self._keep = self._upsert(MARK, {"content": "new"})
+        self._raise = self._upsert(ALARM, dict.fromkeys(("level", "stroke", "reason", "person", "utc", "note"), "new"))
+        self._draw = self._upsert(WEAR_MAP, dict.fromkeys(("square_px", "origin_x_px", "origin_y_px", "arrays"), "new"))
         self._since: dict[int, int] = {}
         file = self._engine.url.database
         if must_exist and self._engine.dialect.name == "sqlite" and not Path(file or "").is_file():
@@ -341,7 +372,54 @@ class RecordStore:
             number = draft.entry("die_event", None, utc, body)
             draft.put(DIE_EVENT, {"number": number, **die_event_of(json.loads(body))})
             self._flush(db, draft)
-        self._since[done.object_index] = number
+        if done.kind != _GOES_ON:
+            self._since[done.object_index] = number
+
+    def append_acknowledgement(self, object_index: int, alarm: StoredAlarm, utc: datetime) -> None:
+        """Commit that somebody took notice of an alarm: as an entry of the chain, and in the alarm's row.
+
+        Raises:
+            RecordError: it could not be made durable.
+        """
+        body = json.dumps({"object_index": object_index, **alarm.__dict__})
+        with self._writing() as db:
+            draft = self._draft(db)
+            draft.entry("acknowledgement", None, utc, body)
+            self._flush(db, draft)
+            db.execute(self._raise, {"object_index": object_index, **alarm.__dict__})
+
+    def keep_alarm(self, object_index: int, alarm: StoredAlarm) -> None:
+        """Keep the state of a zone's alarm.
+
+        Raises:
+            RecordError: it could not be made durable.
+        """
+        with self._writing() as db:
+            db.execute(self._raise, {"object_index": object_index, **alarm.__dict__})
+
+    def keep_map(self, object_index: int, wear: StoredMap) -> None:
+        """Keep a wear map.
+
+        Raises:
+            RecordError: it could not be made durable.
+        """
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **wear.arrays)  # type: ignore[arg-type]
+        row = {
+            "object_index": object_index, "square_px": wear.square_px, "origin_x_px": wear.origin_px[0],
+            "origin_y_px": wear.origin_px[1], "arrays": buffer.getvalue(),
+        }  # fmt: skip
+        with self._writing() as db:
+            db.execute(self._draw, row)
+
+    def drop_map(self, object_index: int) -> None:
+        """Forget a wear map: the die was serviced.
+
+        Raises:
+            RecordError: it could not be made durable.
+        """
+        with self._writing() as db:
+            db.execute(delete(WEAR_MAP).where(WEAR_MAP.c.object_index == object_index))
 
     def prune(self, kept: int, utc: datetime, at_most: int = 500) -> int:
         """Remove the oldest records beyond `kept`, no more than `at_most` at once; returns how many went.
@@ -409,7 +487,9 @@ class RecordStore:
 
     def _since_of(self, db: Connection, object_index: int) -> int:
         if object_index not in self._since:
-            asked = select(func.max(DIE_EVENT.c.number)).where(DIE_EVENT.c.object_index == object_index)
+            asked = select(func.max(DIE_EVENT.c.number)).where(
+                DIE_EVENT.c.object_index == object_index, DIE_EVENT.c.kind != _GOES_ON
+            )
             self._since[object_index] = int(db.execute(asked).scalar() or 0)
         return self._since[object_index]
 
@@ -546,6 +626,35 @@ class RecordStore:
             )  # fmt: skip
             return [(int(s), float(w), int(n)) for s, w, n in db.execute(asked)]
 
+    def newest_decisions(self, object_index: int, last: int) -> list[Decision]:
+        """Of the newest parts, oldest first."""
+        asked = select(RECORD.c.decision).where(RECORD.c.object_index == object_index)
+        with self._reading() as db:
+            found = db.execute(asked.order_by(RECORD.c.number.desc()).limit(last)).scalars()
+            return [Decision(name) for name in found][::-1]
+
+    def alarms(self, object_index: int) -> list[StoredAlarm]:
+        """Of all zones that ever had one."""
+        asked = select(ALARM).where(ALARM.c.object_index == object_index)
+        with self._reading() as db:
+            return [
+                StoredAlarm(**{name: row[name] for name in StoredAlarm.__dataclass_fields__})
+                for row in db.execute(asked).mappings()
+            ]
+
+    def stored_map(self, object_index: int) -> StoredMap | None:
+        """The wear map as it was kept last."""
+        with self._reading() as db:
+            row = db.execute(select(WEAR_MAP).where(WEAR_MAP.c.object_index == object_index)).mappings().first()
+        if row is None:
+            return None
+        with np.load(io.BytesIO(row["arrays"]), allow_pickle=False) as arrays:
+            return StoredMap(
+                row["square_px"],
+                (row["origin_x_px"], row["origin_y_px"]),
+                {name: arrays[name] for name in arrays.files},
+            )
+
     def die_events(self, object_index: int) -> list[tuple[int, str]]:
         """(stroke, kind), oldest first."""
         asked = select(DIE_EVENT.c.stroke, DIE_EVENT.c.kind).where(DIE_EVENT.c.object_index == object_index)
@@ -646,6 +755,8 @@ class RecordStore:
                 found, made = told.get(entry.cycle_id), told_of(Outcome.model_validate_json(entry.body))
                 if found is None:
                     continue  # its verdict was pruned
+            elif entry.kind == "acknowledgement":
+                continue  # the alarm's row follows what comes after it
             else:
                 found, made = events.get(entry.number), die_event_of(json.loads(entry.body))
             if found is None or any(found[name] != value for name, value in made.items()):

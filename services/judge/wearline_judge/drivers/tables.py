@@ -18,6 +18,7 @@ from sqlalchemy import (
     Float,
     Index,
     Integer,
+    LargeBinary,
     MetaData,
     String,
     Table,
@@ -151,4 +152,25 @@ CHECKPOINT = Table(
     Column("utc", String(40), nullable=False),
     Column("is_pruned", Boolean(create_constraint=False), nullable=False, comment="the entries up to it were removed"),
     Column("signature", String(64), nullable=False, comment="HMAC-SHA256 over the other columns"),
+)  # fmt: skip
+
+ALARM = Table(
+    "alarm", METADATA,
+    Column("object_index", Integer, primary_key=True, autoincrement=False),
+    Column("zone", String(32), primary_key=True, comment="empty = the whole part"),
+    Column("level", Integer, nullable=False, comment="0 none to 4 stop"),
+    Column("stroke", BigInteger, nullable=False, comment="at which the level was reached"),
+    Column("reason", Text, nullable=False),
+    Column("person", Text, nullable=False, comment="who acknowledged it; empty = nobody yet"),
+    Column("utc", String(40), nullable=False, comment="when"),
+    Column("note", Text, nullable=False, comment="why"),
+)  # fmt: skip
+
+WEAR_MAP = Table(
+    "wear_map", METADATA,
+    Column("object_index", Integer, primary_key=True, autoincrement=False),
+    Column("square_px", Integer, nullable=False),
+    Column("origin_x_px", Integer, nullable=False),
+    Column("origin_y_px", Integer, nullable=False),
+    Column("arrays", LargeBinary, nullable=False, comment="npz of the running sums"),
 )  # fmt: skip
