@@ -130,6 +130,7 @@ class SimulatedCell:
         name: str = "c1",
         stroke_period_s: float = 0.8,
         first_stroke: int = 1,
+        certificates: Path | None = None,
     ) -> None:
         self.name, self.folder = name, folder
         folder.mkdir(parents=True, exist_ok=True)
@@ -144,7 +145,12 @@ class SimulatedCell:
             "cell": name,
             "data_dir": ".",
             "plc_is_simulated": True,
-            "router": {"endpoint": f"tcp/127.0.0.1:{free_port()}"},
+            "router": {"endpoint": f"tcp/127.0.0.1:{free_port()}"}
+            if certificates is None
+            else {
+                "endpoint": f"tls/127.0.0.1:{free_port()}",
+                "tls": {"authority": str(certificates / "authority.pem"), "folder": str(certificates)},
+            },
             "metrics_ports": self.metrics_ports,
             "capture": {"kind": "sim"},
             "fieldbus": {"plc": {"host": "127.0.0.1", "port": plc_port}},
@@ -172,7 +178,9 @@ class SimulatedCell:
         supervisor = self._supervisor = Supervisor(self.path, with_plc_sim=True)
         self._thread = threading.Thread(target=self._live, args=(supervisor,), name=f"cell {self.name}", daemon=True)
         self._thread.start()
-        self._bus = Bus(self.name, "watcher", supervisor.cell.router.endpoint)
+        router = supervisor.cell.router
+        # With certificates the watcher must be somebody; the HMI hears most.
+        self._bus = Bus(self.name, "watcher" if router.tls is None else "hmi", router.endpoint, router.tls)
         try:
             self._bus.open(timeout_s=20.0)
             for topic in (MEASURE, VERDICT, OUTCOME):
