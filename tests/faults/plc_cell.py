@@ -20,7 +20,7 @@ from wearline_fieldbus.drivers.journal import Journal, JournalSettings
 from wearline_fieldbus.drivers.plc import PlcLink
 from wearline_fieldbus.drivers.s7 import S7Plc, S7Settings
 from wearline_fieldbus.drivers.s7_server import S7Server
-from wearline_fieldbus.service import Fieldbus, quiet_bytes
+from wearline_fieldbus.service import Fieldbus
 
 SCAN_S = 0.005
 REQUEST_DATA, ANSWER_DATA = 35, 25
@@ -180,7 +180,7 @@ class PlcCell:
         self.journal = Journal(folder, JournalSettings(min_free_bytes=0))
         machine = Handshake(BASIC, handshake, plc_is_simulated=False, cycle_prefix="faults")
         port = S7Plc(S7Settings(port=self.proxy.port), BASIC.size, handshake.io_timeout_s)
-        self.link = PlcLink(port, poll_s=0.005, quiet=quiet_bytes(BASIC))
+        self.link = PlcLink(port, poll_s=0.005, quiet=BASIC.life_bytes)
         self.service = Fieldbus("faults", BASIC, machine, self.link, self.journal)
         self._changed = threading.Condition()
         self._is_woken, self._is_ended = False, False

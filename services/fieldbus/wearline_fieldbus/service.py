@@ -90,8 +90,7 @@ class Fieldbus(Service):
         self._checked: list[c.ObjectChecked] = []
         self._answer = c.Answer(False, "")
         self._response_start = profile.span(Direction.RESPONSE)[0]
-        life = profile.field("vision_life")
-        self._life_at = life.byte if life is not None else None
+
         CYCLE.labels(cell)
 
     def start(self, asker: Asker) -> Iterator[Message]:
@@ -243,11 +242,10 @@ class Fieldbus(Service):
                 self._journal.record_outcome(outcome)
             case c.PublishRequest(request):
                 yield request
-            case c.WriteResponse(block, token, not_after_s):
-                self._link.write(self._connection, self._response_start, block, token, not_after_s)
-            case c.WriteLife(value):
-                assert self._life_at is not None
-                self._link.write(self._connection, self._life_at, bytes((value,)))
+            case c.WriteResponse(start, block, token, not_after_s):
+                self._link.write(self._connection, start, block, token, not_after_s)
+            case c.WriteLife(start, content):
+                self._link.write(self._connection, start, content)
             case c.PublishOutcome(outcome):
                 yield outcome
                 self._count(outcome)
@@ -358,13 +356,7 @@ def build(cell: CellSettings, settings: FieldbusSettings) -> Service:
     link = PlcLink(
         port,
         poll_s=settings.plc.poll_ms / 1000.0,
-        quiet=quiet_bytes(profile),
+        quiet=profile.life_bytes,
         observe_poll=POLL.labels(cell.cell).observe,
     )
     return Fieldbus(cell.cell, profile, handshake, link, JournalFile(cell.data_folder("fieldbus"), settings.journal))
-
-
-def quiet_bytes(profile: Profile) -> frozenset[int]:
-    """Bytes of the life counters: their change alone is looked at with the next tick."""
-    fields = (profile.field("plc_life"), profile.field("vision_life"))
-    return frozenset(byte for f in fields if f is not None for byte in range(f.byte, f.byte + f.size))

@@ -30,7 +30,7 @@ from wearline_fieldbus.drivers.plc import PlcLink
 from wearline_fieldbus.drivers.s7 import S7Plc, S7Settings
 from wearline_fieldbus.drivers.s7_server import S7Server
 from wearline_fieldbus.drivers.stroke_log import StrokeLog
-from wearline_fieldbus.service import Fieldbus, build, quiet_bytes
+from wearline_fieldbus.service import Fieldbus, build
 
 
 class Judge:
@@ -48,7 +48,7 @@ class Rig:
     def __init__(self, folder: Path) -> None:
         self.plc = MemoryPlc(BASIC.size)
         self.journal = Journal(folder, JournalSettings(min_free_bytes=0))
-        self.link = PlcLink(self.plc, poll_s=0.001, quiet=quiet_bytes(BASIC))
+        self.link = PlcLink(self.plc, poll_s=0.001, quiet=BASIC.life_bytes)
         machine = Handshake(BASIC, FieldbusSettings().handshake, plc_is_simulated=True, cycle_prefix="rig")
         self.service = Fieldbus("rig", BASIC, machine, self.link, self.journal)
         self.said: list[m.Message] = []

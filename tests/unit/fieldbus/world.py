@@ -137,13 +137,13 @@ class World:
                 self.requests.append(request)
                 self.parts[request.cycle_id] = self.plc.stroke
                 self.edges[request.cycle_id] = self.now_s
-            case c.WriteResponse(block, token, not_after_s):
+            case c.WriteResponse(start, block, token, not_after_s):
                 values = BASIC.decode(bytes(10) + block, Direction.RESPONSE)
                 self.blocks.append((self.now_s, values))
                 self._check_block(values)
-                self.pending.append(Pending(10, block, token, not_after_s))
-            case c.WriteLife(value):
-                self.pending.append(Pending(11, bytes((value,)), None, None))
+                self.pending.append(Pending(start, block, token, not_after_s))
+            case c.WriteLife(start, content):
+                self.pending.append(Pending(start, content, None, None))
             case c.PublishOutcome(outcome):
                 self.outcomes.append(outcome)
                 if outcome.cycle_id in self.journal:

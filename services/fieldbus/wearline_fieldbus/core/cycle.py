@@ -200,8 +200,10 @@ class PublishRequest:
 
 @dataclass(frozen=True)
 class WriteResponse:
-    """Write the whole response block in one PDU."""
+    """Write a block of the response in one PDU."""
 
+    start: int
+    """Its first byte in the image."""
     block: bytes
     token: int
     not_after_s: float | None = None
@@ -210,9 +212,10 @@ class WriteResponse:
 
 @dataclass(frozen=True)
 class WriteLife:
-    """Write the vision life counter alone, so that no result is ever written twice."""
+    """Write the life counters alone, so that no result is ever written twice."""
 
-    value: int
+    start: int
+    content: bytes
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Final
+from typing import Any, Final
 
 from wearline.messages import MeasureRequest, Outcome, ResultCode
 from wearline_fieldbus.core.cycle import (
@@ -75,11 +75,11 @@ class State(StrEnum):
 class Row:
     """One row of the table; ``target`` None = stay."""
 
-    states: tuple[State, ...]
+    states: tuple[StrEnum, ...]
     event: type[Event]
     guards: tuple[str, ...]
     effect: str
-    target: State | None = None
+    target: StrEnum | None = None
 
 
 _S = State
@@ -185,14 +185,15 @@ class Handshake:
         self._plc_is_simulated = plc_is_simulated
         self._cycle_prefix = cycle_prefix
         self._ready = tuple(ready)
-        self._rows: dict[tuple[State, type[Event]], list[Row]] = {}
+        self._rows: dict[tuple[StrEnum, type[Event]], list[Row]] = {}
         for row in table:
             for state in row.states:
                 self._rows.setdefault((state, row.event), []).append(row)
         self._out: list[Action] = []
         self._now = Now(0.0, "")
         self._event: Event = Tick()
-        self.state = State.DOWN
+        # A machine may have more than one region; each has states of a kind of its own.
+        self._regions: dict[type[StrEnum], StrEnum] = {State: State.DOWN}
         self.mode = "auto"
         self.cycle: Cycle | None = None
         self.manual: Cycle | None = None
@@ -210,8 +211,8 @@ class Handshake:
         # What the PLC was last shown.
         self._shown: dict[str, Value] = {}
         self._token = 0
-        self._waiting: dict[int, bytes] = {}
-        self._acknowledged: bytes | None = None
+        self._waiting: dict[int, tuple[int, bytes]] = {}
+        self._acknowledged: bytearray | None = None
         self._acknowledged_writes = 0
         self._result_token = 0
         self._life = 0
@@ -224,9 +225,14 @@ class Handshake:
         self._is_object_settled = True
         self._is_object_changed = False
         self._manual_object: int | None = None
-        self._disk_failed = False
+        self._span = profile.span(Direction.RESPONSE)
 
     # --- what others may know ---
+
+    @property
+    def state(self) -> State:
+        """Where the handshake stands."""
+        return State(self._regions[State])
 
     @property
     def is_linked(self) -> bool:
@@ -269,29 +275,39 @@ class Handshake:
                 ]  # fmt: skip
             elif index == len(cycles) - 1 and one.request.measure_number:
                 ruling = Ruling(one.outcome.code, one.outcome.is_simulated)
-                self.cycle = replace(cycle, ruling=ruling, recorded=one.outcome)
-                self.state = State.DOUBTFUL
+                self._doubt(replace(cycle, ruling=ruling, recorded=one.outcome))
             else:
                 self._out.append(PublishOutcome(one.outcome))
         return self._out
+
+    def _doubt(self, cycle: Cycle) -> None:
+        """An earlier run decided this cycle; whether the PLC was told is not known."""
+        self.cycle = cycle
+        self._regions[State] = State.DOUBTFUL
 
     def handle(self, event: Event, now: Now) -> list[Action]:
         """Everything that follows from one event."""
         self._out, self._now, self._event = [], now, event
         self._observe(event)
-        for row in self._rows.get((self.state, type(event)), ()):
-            if all(self._guard(name) for name in row.guards):
-                # An effect sees the state that it ends in.
-                self.state = row.target or self.state
-                getattr(self, row.effect)()
-                break
+        for region in self._regions:
+            for row in self._rows.get((self._regions[region], type(event)), ()):
+                if all(self._guard(name) for name in row.guards):
+                    # An effect sees the state that it ends in.
+                    self._regions[region] = row.target or self._regions[region]
+                    getattr(self, row.effect)()
+                    break
         self._rises = False
         if isinstance(event, Tick):
             self._step_life()
         return self._out
 
     def _guard(self, name: str) -> bool:
-        return GUARDS[name](self)
+        return self.guards()[name](self)
+
+    @classmethod
+    def guards(cls) -> Mapping[str, Callable[[Any], bool]]:
+        """Every guard of this machine by its name."""
+        return GUARDS
 
     def _observe(self, event: Event) -> None:
         """Take in what an event says, whatever the state."""
@@ -306,9 +322,11 @@ class Handshake:
         elif isinstance(event, Image):
             self._take_image(event, is_first=False)
         elif isinstance(event, Written):
-            block = self._waiting.pop(event.token, None)
-            if block is not None:
-                self._acknowledged = block
+            written = self._waiting.pop(event.token, None)
+            if written is not None:
+                at, block = written[0] - self._span[0], written[1]
+                self._acknowledged = self._acknowledged or bytearray(self._span[1] - self._span[0])
+                self._acknowledged[at : at + len(block)] = block
                 self._acknowledged_writes += 1
         elif isinstance(event, Skipped):
             self._waiting.pop(event.token, None)
@@ -363,18 +381,21 @@ class Handshake:
         self._shown = shown
         known = {f.name for f in self._profile.of(Direction.RESPONSE)}
         values = {k: v for k, v in {**shown, "vision_life": self._life or 1}.items() if k in known}
+        return self._write(self._span[0], self._profile.encode(values, Direction.RESPONSE), not_after_s)
+
+    def _write(self, start: int, block: bytes, not_after_s: float | None = None) -> int:
         self._token += 1
-        block = self._profile.encode(values, Direction.RESPONSE)
-        self._waiting[self._token] = block
-        self._out.append(WriteResponse(block, self._token, not_after_s))
+        self._waiting[self._token] = (start, block)
+        self._out.append(WriteResponse(start, block, self._token, not_after_s))
         return self._token
 
     def _step_life(self) -> None:
-        if self.state not in _LINKED or self._now.s < self._life_due_s or self._profile.field("vision_life") is None:
+        field = self._profile.field("vision_life")
+        if self.state not in _LINKED or self._now.s < self._life_due_s or field is None:
             return
         self._life_due_s = self._now.s + self._settings.vision_life_period_s
         self._life = self._life % 255 + 1
-        self._out.append(WriteLife(self._life))
+        self._out.append(WriteLife(field.byte, bytes((self._life,))))
 
     def _say(self, level: str, text: str, cycle: Cycle | None = None) -> None:
         self._out.append(Say(level, text, cycle.cycle_id if cycle else ""))
@@ -672,11 +693,9 @@ def _response_is_disturbed(machine: Handshake) -> bool:
     acknowledged = machine._acknowledged
     if not isinstance(image, Image) or acknowledged is None or image.writes != machine._acknowledged_writes:
         return False
-    start, end = machine._profile.span(Direction.RESPONSE)
-    life = machine._profile.field("vision_life")
-    skipped = -1 if life is None else life.byte - start
-    found = image.content[start:end]
-    return found[:skipped] != acknowledged[:skipped] or found[skipped + 1 :] != acknowledged[skipped + 1 :]
+    start, end = machine._span
+    found, life = image.content[start:end], machine._profile.life_bytes
+    return any(found[i] != acknowledged[i] for i in range(end - start) if start + i not in life)
 
 
 def _number_is_new(machine: Handshake) -> bool:
@@ -769,7 +788,6 @@ GUARDS: Mapping[str, Callable[[Handshake], bool]] = {
 
 def _was_ready(machine: Handshake) -> bool:
     """Whether the block that the PLC acknowledged last says Ready."""
-    start, _ = machine._profile.span(Direction.RESPONSE)
     ready = machine._profile.field("ready")
     assert ready is not None and ready.bit is not None and machine._acknowledged is not None
-    return bool(machine._acknowledged[ready.byte - start] >> ready.bit & 1)
+    return bool(machine._acknowledged[ready.byte - machine._span[0]] >> ready.bit & 1)

@@ -15,6 +15,7 @@ from typing import Any
 from wearline.errors import ConfigError
 
 Value = bool | int | float | str
+LIFE = ("plc_life", "vision_life", "plc_life_echo", "vision_life_echo")
 MAX_DIRECTION_BYTES = 200
 """One direction fits one PDU of the smallest negotiated size (240 bytes, S7-1200), so it is never torn."""
 
@@ -102,6 +103,12 @@ class Profile:
     def size(self) -> int:
         """Bytes of the whole image, from byte 0."""
         return max(f.byte + f.size for f in self.fields)
+
+    @property
+    def life_bytes(self) -> frozenset[int]:
+        """Bytes of the life counters: their change says nothing but that somebody lives."""
+        fields = [f for f in self.fields if f.name in LIFE]
+        return frozenset(byte for f in fields for byte in range(f.byte, f.byte + f.size))
 
     def decode(self, image: bytes, direction: Direction) -> dict[str, Value]:
         """Values of one direction from the whole image.
