@@ -16,6 +16,7 @@ from wearline.topics import (
     DIE_EVENT,
     DO_MEASURE,
     EVENTS,
+    EXPOSED,
     FRAME,
     JOURNAL,
     LINE_POINTS,
@@ -44,7 +45,7 @@ HEARS: dict[str, tuple[Topic, ...]] = {
     # Its own, too: replicas listen whether the first of them has answered.
     "reconstruct": (MEASURE, FRAME, LINE_POINTS),
     "judge": (MEASURE, FRAME, LINE_POINTS, OUTCOME),
-    "fieldbus": (VERDICT, *STATES.values()),
+    "fieldbus": (EXPOSED, VERDICT, *STATES.values()),
     "hmi": (MEASURE, PREVIEW, VERDICT, VIEW, OUTCOME, *STATES.values(), *EVENTS.values()),
 }
 """Topics that a service may subscribe to."""
@@ -53,7 +54,7 @@ ASKS: dict[str, tuple[Query, ...]] = {
     "capture": (),
     "reconstruct": (RECIPE, ARTIFACT),
     "judge": (JOURNAL,),
-    "fieldbus": (RECIPE,),
+    "fieldbus": (RECIPE, RECORDS),
     "hmi": (
         RECIPE, RECIPE_LIST, RECORDS, WEAR_MAP, TEACH, DIE_EVENT, ACKNOWLEDGE, DO_MEASURE, SELECT_OBJECT, MODE,
         SET_CAMERA,

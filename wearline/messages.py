@@ -158,6 +158,10 @@ class Frame(FromCycle):
     refusal: str = ""
 
 
+class Exposed(FromCycle):
+    """capture: the picture is taken, the part may move; said also where the picture is refused."""
+
+
 class FrameQuality(Message):
     """What one frame says of itself; NaN is not allowed, absent is None."""
 

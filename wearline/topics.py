@@ -44,6 +44,7 @@ class Topic:
 # A camera that joins late must not take a picture for a stroke that has gone.
 MEASURE = Topic("measure", "fieldbus", m.MeasureRequest, Delivery.KEPT, keep_s=1.0)
 FRAME = Topic("frame", "capture", m.Frame, Delivery.EVERY)
+EXPOSED = Topic("exposed", "capture", m.Exposed, Delivery.EVERY)
 PREVIEW = Topic("preview", "capture", m.Preview, Delivery.LATEST, 3.0)
 LINE_POINTS = Topic("line_points", "reconstruct", m.LinePoints, Delivery.EVERY)
 VERDICT = Topic("verdict", "judge", m.Verdict, Delivery.KEPT)
@@ -53,7 +54,7 @@ STATES = {s: Topic("state", s, m.ServiceState, Delivery.LATEST, 1.0) for s in SE
 EVENTS = {s: Topic("event", s, m.Event, Delivery.KEPT) for s in SERVICES}
 
 TOPICS: tuple[Topic, ...] = (
-    MEASURE, FRAME, PREVIEW, LINE_POINTS, VERDICT, VIEW, OUTCOME, *STATES.values(), *EVENTS.values(),
+    MEASURE, FRAME, EXPOSED, PREVIEW, LINE_POINTS, VERDICT, VIEW, OUTCOME, *STATES.values(), *EVENTS.values(),
 )  # fmt: skip
 
 

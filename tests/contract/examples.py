@@ -70,6 +70,7 @@ EXAMPLES: tuple[m.Message, ...] = (
         **CYCLE, request=REQUEST, camera="sim", pixels=np.zeros((0, 0), np.uint8), exposure_us=1e4, frame_counter=9,
         refusal_code=16, refusal="camera does not answer",
     ),
+    m.Exposed(**CYCLE),
     m.LinePoints(
         **CYCLE, request=REQUEST, points=np.array([[0, 1.5, 2, 0.125, 0.01]], np.float32), quality=QUALITY,
         timings_ms={"peaks": 3.25}, coverage=0.5, frame_hash="f", calibration_hash="c", recipe_hash="r",

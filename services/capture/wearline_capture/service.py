@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from wearline.config import CellSettings
 from wearline.errors import ConfigError, DeviceError, FrameError
-from wearline.messages import Done, Event, Frame, MeasureRequest, Message, Preview, ResultCode, SetCamera
+from wearline.messages import Done, Event, Exposed, Frame, MeasureRequest, Message, Preview, ResultCode, SetCamera
 from wearline.metrics import counter
 from wearline.service import Health, Service
 from wearline.topics import MEASURE, SET_CAMERA, Query, Topic
@@ -67,6 +67,7 @@ class Capture(Service):
             # A driver's own fault must reach the PLC at once too, not when the deadline has passed.
             frame = self._refusal(request, int(ResultCode.CAMERA), f"{type(error).__name__}: {error}")
         yield frame
+        yield Exposed(cycle_id=frame.cycle_id, is_simulated=frame.is_simulated)
         yield from self._account(frame)
 
     def on_set_camera(self, wanted: SetCamera) -> Done:

@@ -12,7 +12,7 @@ import pytest
 
 from wearline.config import CellSettings, validated
 from wearline.errors import ConfigError, DeviceError
-from wearline.messages import Done, Event, Frame, MeasureRequest, Preview, ResultCode, SetCamera
+from wearline.messages import Done, Event, Exposed, Frame, MeasureRequest, Preview, ResultCode, SetCamera
 from wearline.topics import MEASURE, SET_CAMERA
 from wearline_capture.config import CaptureSettings
 from wearline_capture.core.exposure import ExposureSettings, checked_exposure_us
@@ -131,14 +131,15 @@ def test_a_broken_die_file_is_a_camera_fault(tmp_path: Path, text: str) -> None:
 def test_a_camera_fault_is_told_at_once_and_forgotten_when_it_is_gone(error: Exception, code: ResultCode) -> None:
     camera = Broken(error)
     service = Capture("one", CaptureSettings(), camera)
-    frame, event = list(service.on_measure(request(9)))
+    frame, _, event = list(service.on_measure(request(9)))
     assert isinstance(frame, Frame) and isinstance(event, Event)
     assert (frame.refusal_code, frame.pixels.shape, frame.cycle_id) == (code, (0, 0), "cycle-9")
     assert str(error) in frame.refusal and event.cycle_id == "cycle-9"
     assert service.health().status == "degraded"
     assert list(service.tick(0.0)) == []
     camera.error = None
-    (good,) = service.on_measure(request(10))
+    good, exposed = service.on_measure(request(10))
+    assert isinstance(exposed, Exposed) and exposed.cycle_id == "cycle-10"
     assert isinstance(good, Frame) and good.refusal_code == 0 and not good.is_simulated and good.frame_counter == 5
     assert service.health().status == "ready"
     service.close()
