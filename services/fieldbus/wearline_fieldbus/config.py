@@ -23,8 +23,8 @@ class PlcSettings(S7Settings):
 class FieldbusSettings(Settings):
     """The PLC side of the cell."""
 
-    profile: Literal["basic"] = "basic"
-    """The layout of the process image."""
+    profile: Literal["basic", "extended"] = "basic"
+    """The layout of the process image and its handshake."""
     remap: dict[str, str] = Field(default_factory=dict)
     """Field -> address (``12.3`` or ``14``), or ``-`` to leave it out."""
     plc: PlcSettings = PlcSettings()
@@ -34,6 +34,9 @@ class FieldbusSettings(Settings):
 
 class PlcSimSettings(SoftPlcSettings):
     """The simulated PLC: `wearline plc-sim`."""
+
+    profile: Literal["basic", "extended"] = "basic"
+    """As fieldbus has it."""
 
     host: str = "127.0.0.1"
     port: int = Field(default=1102, ge=0, le=65535)

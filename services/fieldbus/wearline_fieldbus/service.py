@@ -6,6 +6,7 @@ import json
 import secrets
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from typing import Any, ClassVar
@@ -15,12 +16,15 @@ from wearline.errors import RecordError, WearlineError
 from wearline.messages import (
     AskJournal,
     AskRecipe,
+    AskRecords,
     DoMeasure,
     Done,
     Event,
+    Exposed,
     Journal,
     Message,
     Outcome,
+    Records,
     ResultCode,
     SelectObject,
     SetMode,
@@ -28,9 +32,10 @@ from wearline.messages import (
 )
 from wearline.metrics import counter, gauge, histogram
 from wearline.service import Asker, Health, Service
-from wearline.topics import DO_MEASURE, JOURNAL, MODE, RECIPE, SELECT_OBJECT, VERDICT, Query, Topic
+from wearline.topics import DO_MEASURE, EXPOSED, JOURNAL, MODE, RECIPE, RECORDS, SELECT_OBJECT, VERDICT, Query, Topic
 from wearline_fieldbus.config import FieldbusSettings
 from wearline_fieldbus.core import cycle as c
+from wearline_fieldbus.core.extended import ExtendedHandshake
 from wearline_fieldbus.core.handshake import Handshake, Recovered
 from wearline_fieldbus.core.profiles import PROFILES, Direction, Profile, image_rows, remapped
 from wearline_fieldbus.drivers.journal import Journal as JournalFile
@@ -58,7 +63,10 @@ POLL = histogram(
 TICK_S = 0.05
 ROOM_S = 1.0
 """Between two looks at the disk. [s]"""
-CHECK_OBJECT_S = 1.0
+ASK_S = 1.0
+"""For an answer of judge. [s]"""
+TREND_S = 10.0
+"""Between two questions about the wear. [s]"""
 _DECISION = {ResultCode.PASSED: "PASSED", ResultCode.FAILED: "FAILED", ResultCode.UNSURE: "UNSURE"}
 
 
@@ -87,7 +95,9 @@ class Fieldbus(Service):
         self._room_at_s = 0.0
         self._unrecorded: list[Outcome] = []
         self._later: list[Message] = []
-        self._checked: list[c.ObjectChecked] = []
+        self._learnt: deque[c.Event] = deque()
+        """What judge answered, on threads of their own."""
+        self._trend_at_s = 0.0
         self._answer = c.Answer(False, "")
         self._response_start = profile.span(Direction.RESPONSE)[0]
 
@@ -111,7 +121,7 @@ class Fieldbus(Service):
         self._link.start()
 
     def handlers(self) -> Mapping[Topic, Callable[[Any], Iterable[Message]]]:
-        return {VERDICT: self.on_verdict}
+        return {VERDICT: self.on_verdict, EXPOSED: self.on_exposed}
 
     def answers(self) -> Mapping[Query, Callable[[Any], Message]]:
         return {
@@ -127,6 +137,10 @@ class Fieldbus(Service):
         yield from self._drain()
         yield from self._feed(c.VerdictCame(verdict))
 
+    def on_exposed(self, exposed: Exposed) -> Iterator[Message]:
+        """The picture is taken: the part may move."""
+        yield from self._feed(c.ExposureEnded(exposed.cycle_id))
+
     def on_alive(self, service: str, is_alive: bool) -> Iterator[Message]:
         yield from self._feed(c.ServiceChanged(service, is_alive))
 
@@ -139,6 +153,14 @@ class Fieldbus(Service):
             self._room_at_s = now_s
             yield from self._look_at_disk()
         yield from self._feed(c.Tick())
+        index = self._handshake.object_index
+        if (
+            self._profile.field("wear_percent") is not None
+            and index is not None
+            and now_s - self._trend_at_s >= TREND_S
+        ):
+            self._trend_at_s = now_s
+            threading.Thread(target=self._ask_trend, args=(index,), name="trend", daemon=True).start()
         LINK_UP.labels(self._cell).set(float(self._handshake.is_linked))
 
     def on_do_measure(self, wanted: DoMeasure) -> Done:
@@ -194,8 +216,8 @@ class Fieldbus(Service):
     def _drain(self) -> Iterator[Message]:
         for told in self._link.take():
             yield from self._feed(self._event_of(told))
-        while self._checked:
-            yield from self._feed(self._checked.pop(0))
+        while self._learnt:
+            yield from self._feed(self._learnt.popleft())
 
     def _event_of(self, told: LinkEvent) -> c.Event:
         """What the link's thread told, in the handshake's words."""
@@ -297,13 +319,32 @@ class Fieldbus(Service):
         is_known = False
         try:
             assert self._asker is not None
-            self._asker.ask(RECIPE, AskRecipe(object_index=index), str(index), CHECK_OBJECT_S)
+            self._asker.ask(RECIPE, AskRecipe(object_index=index), str(index), ASK_S)
             is_known = True
         except WearlineError:
             # Not known, or nobody there to know it: a Measure will say which.
             is_known = False
-        self._checked.append(c.ObjectChecked(index, is_known))
+        self._learnt.append(c.ObjectChecked(index, is_known))
         self.wake()
+
+    def _ask_trend(self, index: int) -> None:
+        try:
+            assert self._asker is not None
+            answer = self._asker.ask(RECORDS, AskRecords(last=1, object_index=index), timeout_s=ASK_S)
+        except WearlineError:
+            return
+        trends = answer.trends if isinstance(answer, Records) else ()
+        trend = next((t for t in trends if t.object_index == index), None)
+        if trend is None:
+            return
+        remaining, wear, limit = trend.remaining_p10, trend.wear_mm, trend.limit_mm
+        self._learnt.append(
+            c.TrendKnown(
+                index,
+                None if remaining is None else round(remaining),
+                None if wear is None or not limit else round(100.0 * wear / limit),
+            )
+        )
 
     def _count(self, outcome: Outcome) -> None:
         index = outcome.request.object_index
@@ -341,7 +382,8 @@ def build(cell: CellSettings, settings: FieldbusSettings) -> Service:
         RecordError: the journal cannot be used.
     """
     profile = make_profile(settings)
-    handshake = Handshake(
+    machine = {"basic": Handshake, "extended": ExtendedHandshake}[settings.profile]
+    handshake = machine(
         profile,
         settings.handshake,
         plc_is_simulated=cell.plc_is_simulated,

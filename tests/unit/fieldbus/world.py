@@ -9,8 +9,8 @@ from typing import Any
 from wearline.messages import Decision, MeasureRequest, Outcome, Verdict
 from wearline_fieldbus.core import cycle as c
 from wearline_fieldbus.core.handshake import READY, TABLE, Handshake, Recovered, Row, State
-from wearline_fieldbus.core.profiles import BASIC, Direction, Value
-from wearline_fieldbus.core.soft_plc import Belief, SoftPlc, SoftPlcSettings
+from wearline_fieldbus.core.profiles import BASIC, Direction, Profile, Value
+from wearline_fieldbus.core.soft_plc import SOFT_PLCS, Belief, SoftPlcSettings
 
 CODES = {Decision.PASSED: 1, Decision.FAILED: 2, Decision.UNSURE: 3, Decision.NOT_MEASURED: 12}
 
@@ -53,11 +53,14 @@ class World:
     table: tuple[Row, ...] = TABLE
     ready: tuple[str, ...] = tuple(READY)
     has_plc_program: bool = True
+    profile: Profile = BASIC
+    machine_type: type[Handshake] = Handshake
 
     def __post_init__(self) -> None:
         self.now_s = 100.0
-        self.memory = bytearray(BASIC.size)
-        self.plc = SoftPlc(self.plc_settings)
+        self.memory = bytearray(self.profile.size)
+        self.requests_end = self.profile.span(Direction.REQUEST)[1]
+        self.plc = SOFT_PLCS[self.profile.name](self.plc_settings)
         self.is_plc_running = True
         self.is_connected = False
         self.pending: deque[Pending] = deque()
@@ -77,6 +80,7 @@ class World:
         self.checks: list[int] = []
         self.unanswered: list[int] = []
         """Objects that judge was asked about and has not yet answered."""
+        self.unknown_objects: set[int] = set()
         self.answers: list[c.Answer] = []
         self.blocks: list[tuple[float, dict[str, Value]]] = []
         """Response blocks that were handed to the link."""
@@ -90,8 +94,8 @@ class World:
     def boot(self) -> None:
         """Start (anew): all that is left of an earlier run is the journal."""
         self.runs += 1
-        self.machine = Handshake(
-            BASIC, self.settings, plc_is_simulated=self.plc_is_simulated, cycle_prefix=f"run{self.runs}",
+        self.machine = self.machine_type(
+            self.profile, self.settings, plc_is_simulated=self.plc_is_simulated, cycle_prefix=f"run{self.runs}",
             table=self.table, ready=self.ready,
         )  # fmt: skip
         unfinished = [e for e in self.journal.values() if not e.is_ended]
@@ -138,9 +142,9 @@ class World:
                 self.parts[request.cycle_id] = self.plc.stroke
                 self.edges[request.cycle_id] = self.now_s
             case c.WriteResponse(start, block, token, not_after_s):
-                values = BASIC.decode(bytes(10) + block, Direction.RESPONSE)
+                values = self._decoded(start, block)
                 self.blocks.append((self.now_s, values))
-                self._check_block(values)
+                (self._check_block if self.profile is BASIC else self._check_extended)(start, block, values)
                 self.pending.append(Pending(start, block, token, not_after_s))
             case c.WriteLife(start, content):
                 self.pending.append(Pending(start, content, None, None))
@@ -163,7 +167,25 @@ class World:
             return True
         return False
 
-    def _check_block(self, values: dict[str, Value]) -> None:
+    def _decoded(self, start: int, block: bytes) -> dict[str, Value]:
+        return self.profile.decode((bytes(start) + block).ljust(self.profile.size, b"\0"), Direction.RESPONSE)
+
+    def _check_extended(self, start: int, block: bytes, values: dict[str, Value]) -> None:
+        assert start >= 58 and values["status_number"] == values["status_number_end"] != 0
+        if len(block) <= 12:
+            return
+        assert values["result_number"] == values["result_number_end"]
+        if values["result_valid"]:
+            assert values["result_number"] and bool(values["ok"]) is not bool(values["nok"])
+            assert bool(values["ok"]) is (values["result_code"] == 1)
+            told = self.machine._told  # type: ignore[attr-defined]
+            assert told is not None and values["echo"] == told.request.measure_number
+            entry = self.journal.get(told.cycle_id)
+            assert values["result_code"] == 20 or (entry is not None and entry.outcome is not None), "not recorded"
+        else:
+            assert not any(values[name] for name in ("ok", "nok", "result_number", "result_code", "echo"))
+
+    def _check_block(self, start: int, block: bytes, values: dict[str, Value]) -> None:
         signs = (bool(values["passed"]), bool(values["failed"]))
         assert signs in ((False, True), (True, False)) if values["measure_finished"] else signs == (False, False)
         assert not values["passed"] or values["result_code"] == 1
@@ -197,9 +219,8 @@ class World:
             self.feed(c.LinkLost("cut"))
 
     def _apply(self, write: Pending) -> None:
-        values = BASIC.decode(bytes(write.start) + write.block.ljust(BASIC.size, b"\0"), Direction.RESPONSE)
-        if write.start == 10 and values["measure_finished"]:
-            assert write.not_after_s is not None and self.now_s <= write.not_after_s + 0.5
+        if write.not_after_s is not None:
+            assert self.now_s <= write.not_after_s + 0.5
         self.memory[write.start : write.start + len(write.block)] = write.block
 
     def _read(self) -> c.Image:
@@ -226,25 +247,25 @@ class World:
     def scan(self) -> None:
         """One scan of the PLC's program."""
         if self.is_plc_running and self.has_plc_program:
-            belief = self.plc.scan(BASIC.decode(bytes(self.memory), Direction.RESPONSE), self.now_s)
-            self.memory[0:10] = BASIC.encode(self.plc.request(), Direction.REQUEST)
+            belief = self.plc.scan(self.shown(), self.now_s)
+            self.memory[0 : self.requests_end] = self.profile.encode(self.plc.request(), Direction.REQUEST)
             if belief is not None:
                 self.beliefs.append(belief)
 
     def restart_plc(self) -> None:
         """Power off and on: memory initialised, connections gone, numbers retained."""
         self.cut()
-        self.memory[:] = bytes(BASIC.size)
-        self.plc = SoftPlc(self.plc_settings, self.plc.stroke, self.plc.measure_number)
+        self.memory[:] = bytes(self.profile.size)
+        self.plc = SOFT_PLCS[self.profile.name](self.plc_settings, self.plc.stroke, self.plc.measure_number)
 
     def ask(self, **values: Value) -> None:
         """What a PLC without a program writes, by hand: what is not named keeps its value."""
-        request = {**BASIC.decode(bytes(self.memory), Direction.REQUEST), **values}
-        self.memory[0:10] = BASIC.encode(request, Direction.REQUEST)
+        request = {**self.profile.decode(bytes(self.memory), Direction.REQUEST), **values}
+        self.memory[0 : self.requests_end] = self.profile.encode(request, Direction.REQUEST)
 
     def shown(self) -> dict[str, Value]:
         """The response as the PLC's memory holds it."""
-        return BASIC.decode(bytes(self.memory), Direction.RESPONSE)
+        return self.profile.decode(bytes(self.memory), Direction.RESPONSE)
 
     # --- time ---
 
@@ -254,7 +275,8 @@ class World:
         while self.now_s < end_s - 1e-9:
             self.now_s += step_s
             while self.unanswered:
-                self.feed(c.ObjectChecked(self.unanswered.pop(0), True))
+                index = self.unanswered.pop(0)
+                self.feed(c.ObjectChecked(index, index not in self.unknown_objects))
             self.poll()
             self.scan()
             self.feed(c.Tick())

@@ -13,8 +13,8 @@ from wearline.config import load_cell, validated
 from wearline.log import start_log
 from wearline.stop import StopSignal
 from wearline_fieldbus.config import PlcSimSettings
-from wearline_fieldbus.core.profiles import BASIC, Direction
-from wearline_fieldbus.core.soft_plc import SoftPlc
+from wearline_fieldbus.core.profiles import PROFILES, Direction
+from wearline_fieldbus.core.soft_plc import SOFT_PLCS, SoftPlc
 from wearline_fieldbus.drivers.s7_server import S7Server
 from wearline_fieldbus.drivers.stroke_log import StrokeLog
 
@@ -26,17 +26,19 @@ RELEASE_S = 0.5
 
 def _configure_plc_sim(parser: ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, required=True, metavar="CELL.yaml")
+    parser.add_argument("--profile", choices=tuple(PROFILES), help="layout of the DB (default: as cell.yaml says)")
     parser.add_argument("--strokes", type=int, metavar="N", help="end after so many (default: as cell.yaml says)")
 
 
 def _run_plc_sim(arguments: Namespace) -> int:
     cell = load_cell(arguments.config)
-    section = {**cell.plc_sim, **({} if arguments.strokes is None else {"strokes": arguments.strokes})}
+    given = {"strokes": arguments.strokes, "profile": arguments.profile or cell.fieldbus.get("profile")}
+    section = {**cell.plc_sim, **{name: value for name, value in given.items() if value is not None}}
     settings = validated(PlcSimSettings, section, f"{arguments.config}: plc_sim")
     start_log(cell.cell, "plc-sim")
     log = StrokeLog(cell.data_folder("plc_sim") / "log.jsonl")
-    plc = SoftPlc(settings, log.stroke, log.measure_number)
-    server = S7Server(settings.host, settings.port, settings.db, BASIC.size)
+    plc = SOFT_PLCS[settings.profile](settings, log.stroke, log.measure_number)
+    server = S7Server(settings.host, settings.port, settings.db, PROFILES[settings.profile].size)
     LOG.info("soft PLC: DB%d on %s:%d, stroke %d comes next", settings.db, settings.host, server.port, plc.stroke + 1)
     try:
         with StopSignal() as stop:
@@ -49,13 +51,14 @@ def _run_plc_sim(arguments: Namespace) -> int:
 
 def _run_program(plc: SoftPlc, server: S7Server, log: StrokeLog, settings: PlcSimSettings, stop: StopSignal) -> None:
     """Scan until stopped, or until the last stroke is over and its result taken back (with a limit to the wait)."""
-    start, end = BASIC.span(Direction.REQUEST)
+    profile = PROFILES[settings.profile]
+    start, end = profile.span(Direction.REQUEST)
     due_s = time.monotonic()
     end_s = float("inf")
     while due_s < end_s and not (settings.strokes is not None and log.lines >= settings.strokes and plc.is_released):
         with server.memory() as memory:
-            belief = plc.scan(BASIC.decode(bytes(memory), Direction.RESPONSE), time.monotonic())
-            memory[start:end] = BASIC.encode(plc.request(), Direction.REQUEST)
+            belief = plc.scan(profile.decode(bytes(memory), Direction.RESPONSE), time.monotonic())
+            memory[start:end] = profile.encode(plc.request(), Direction.REQUEST)
         if belief is not None:
             log.add(asdict(belief))
             if log.lines == settings.strokes:

@@ -114,6 +114,24 @@ class VerdictCame:
 
 
 @dataclass(frozen=True)
+class ExposureEnded:
+    """The camera has taken the picture of a cycle: the part may move."""
+
+    cycle_id: str
+
+
+@dataclass(frozen=True)
+class TrendKnown:
+    """What judge knows of the wear of an object."""
+
+    object_index: int
+    remaining_strokes: int | None
+    """With 90 % confidence; None = not known."""
+    wear_percent: int | None
+    """Of the limit; None = not known."""
+
+
+@dataclass(frozen=True)
 class ServiceChanged:
     """A service of the cell came or went."""
 
@@ -169,7 +187,7 @@ class Tick:
 
 Event = (
     Image | Linked | LinkLost | Written | Skipped | VerdictCame | ServiceChanged | RoomChanged | NotRecorded
-    | ObjectChecked | ModeWanted | ObjectWanted | MeasureWanted | Tick
+    | ExposureEnded | TrendKnown | ObjectChecked | ModeWanted | ObjectWanted | MeasureWanted | Tick
 )  # fmt: skip
 
 
@@ -286,6 +304,7 @@ class Cycle:
     """Services of the chain that went away since."""
     ruling: Ruling | None = None
     """None until it is decided."""
+    decided_s: float = 0.0
     recorded: Outcome | None = None
     """As an earlier run of the service recorded it."""
 

@@ -435,8 +435,12 @@ class Handshake:
         )
         self._last_number = self.cycle.request.measure_number
         self._last_edge_s = self.cycle.edge_s
-        self._out += [RecordAccepted(self.cycle), PublishRequest(self.cycle.request)]
+        self._record_and_request(self.cycle)
         self._show()
+
+    def _record_and_request(self, cycle: Cycle) -> None:
+        """On disk first, then measured."""
+        self._out += [RecordAccepted(cycle), PublishRequest(cycle.request)]
 
     def _new_cycle(self, object_index: int, stroke: int, measure_number: int, is_manual: bool = False) -> Cycle:
         self._count += 1

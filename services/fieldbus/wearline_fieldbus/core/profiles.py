@@ -203,7 +203,74 @@ BASIC = Profile(
     ),
 )  # fmt: skip
 
-PROFILES: Mapping[str, Profile] = {BASIC.name: BASIC}
+PART_ID_LENGTH = 30
+NO_STROKES = 0xFFFFFFFF
+"""Remaining strokes where they cannot be told."""
+
+EXTENDED = Profile(
+    "extended",
+    (
+        _request("sequence", 0, None, WORD, "changes with every change of this block", is_needed=True),
+        _request("trigger_enable", 2, 0, BOOL, "1 = triggers may come; 0 = reset", is_needed=True),
+        _request(
+            "trigger", 2, 1, BOOL, "rising edge = measure this part; hold until Trigger ack equals it", is_needed=True
+        ),
+        _request("result_ack", 2, 2, BOOL, "1 = result read; hold until Result valid is 0", is_needed=True),
+        _request("command_execute", 2, 3, BOOL, "rising edge = do the command; hold until done or failed"),
+        _request("clear_error", 2, 4, BOOL, "rising edge = forget Error and Buffer overrun"),
+        _request("plc_life", 4, None, WORD, "life counter of the PLC, changes every scan (0 = not supervised)"),
+        _request("vision_life_echo", 6, None, WORD, "Wearline's life counter, as the PLC last read it"),
+        _request("command", 8, None, WORD, "1 = select object (argument), 2 = mode (argument 0 manual, 1 automatic)"),
+        _request("argument", 10, None, WORD, "of the command"),
+        _request(
+            "measure_number", 12, None, WORD, "1-65535, another one for every trigger, written before it",
+            is_needed=True,
+        ),
+        _request("stroke", 16, None, DWORD, "the press' stroke counter"),
+        _request("part_id", 20, None, string(PART_ID_LENGTH), "as the PLC names the part"),
+        _request("sequence_end", 52, None, WORD, "the same as sequence, or the block is torn", is_needed=True),
+        _response("vision_life", 54, None, WORD, "life counter of Wearline, 1-65535"),
+        _response("plc_life_echo", 56, None, WORD, "the PLC's life counter, as Wearline last read it"),
+        _response("status_number", 58, None, WORD, "changes with every change of the status (bytes 58-69)"),
+        _response("online", 60, 0, BOOL, "1 = measuring chain, disk and mode allow triggers"),
+        _response("ready", 60, 1, BOOL, "1 = a trigger will be accepted", is_needed=True),
+        _response("trigger_ack", 60, 2, BOOL, "equals Trigger once it was accepted", is_needed=True),
+        _response("busy", 60, 3, BOOL, "1 = a part is being measured"),
+        _response("exposure_done", 60, 4, BOOL, "1 = the picture is taken, the part may move"),
+        _response("result_valid", 60, 5, BOOL, "1 = the result below is valid", is_needed=True),
+        _response("buffer_overrun", 60, 6, BOOL, "1 = a result was given up because the PLC did not fetch it in time"),
+        _response("error", 60, 7, BOOL, "1 = Error code says what was refused"),
+        _response("mode", 61, 0, BOOL, "1 = automatic, 0 = manual (no trigger is accepted)"),
+        _response("command_executing", 61, 1, BOOL, "1 = the command is being done"),
+        _response("command_done", 61, 2, BOOL, "1 = done, until Execute is 0"),
+        _response("command_failed", 61, 3, BOOL, "1 = refused, until Execute is 0"),
+        _response("fault", 61, 4, BOOL, "1 = equipment fault (a service, the camera or the disk)"),
+        _response("error_code", 62, None, WORD, "as result code; 101 not ready, 102 number, 103 unknown command"),
+        _response("object_index", 64, None, WORD, "object in force"),
+        _response("results_waiting", 66, None, WORD, "results in the buffer (8 at most), the shown one not counted"),
+        _response("status_number_end", 68, None, WORD, "the same as status number, or the status is torn"),
+        _response("result_number", 70, None, WORD, "1-65535, another one for every result", is_needed=True),
+        _response("ok", 72, 0, BOOL, "1 = part is good; only with result code 1", is_needed=True),
+        _response("nok", 72, 1, BOOL, "the opposite of OK in every valid result", is_needed=True),
+        _response("unsure", 72, 2, BOOL, "1 = inside the guard band"),
+        _response("simulated", 72, 3, BOOL, "1 = the result comes from a simulation", is_needed=True),
+        _response("result_code", 74, None, WORD, "1 passed, 2 failed, 3 unsure, 10-99 not measured", is_needed=True),
+        _response("echo", 76, None, WORD, "measure number of the trigger that the result answers", is_needed=True),
+        _response("worst_zone", 78, None, WORD, "number of the recipe's zone with the largest error, 0 = none"),
+        _response("echo_stroke", 80, None, DWORD, "stroke that the result answers"),
+        _response("max_error_mm", 84, None, REAL, "largest absolute error [mm], -1 = none"),
+        _response("p95_error_mm", 88, None, REAL, "95th percentile of the error in the worst region [mm], -1 = none"),
+        _response("mean_error_mm", 92, None, REAL, "mean error [mm], -1 = none"),
+        _response("wear_mm", 96, None, REAL, "wear of this stroke [mm], -1 = none"),
+        _response("wear_percent", 100, None, WORD, "wear level in per cent of its limit, 65535 = not known"),
+        _response("cycle_ms", 102, None, WORD, "from trigger to decision [ms]"),
+        _response("remaining_strokes", 104, None, DWORD, "until the limit (90 % confidence), 16#FFFFFFFF = not known"),
+        _response("echo_part_id", 108, None, string(PART_ID_LENGTH), "part that the result answers", is_needed=True),
+        _response("result_number_end", 140, None, WORD, "the same as result number, or it is torn", is_needed=True),
+    ),
+)  # fmt: skip
+
+PROFILES: Mapping[str, Profile] = {p.name: p for p in (BASIC, EXTENDED)}
 
 
 def remapped(profile: Profile, moves: Mapping[str, str], is_numbered: bool, where: str) -> Profile:
