@@ -9,11 +9,9 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from wearline.artifact import Calibration, Template
 from wearline.cli import Command, progress
@@ -26,8 +24,8 @@ from wearline_reconstruct.config import ReconstructSettings
 from wearline_reconstruct.core.calibration import CalibrationSettings, Shot, calibrate
 from wearline_reconstruct.core.chain import prepare
 from wearline_reconstruct.core.lateral import Target, distance_mm, find_target, fit_lateral, positions_mm, scale_of
-from wearline_reconstruct.core.lines import Fragments, fragments
-from wearline_reconstruct.core.stripes import estimate_scale, strip_image, stripe_peaks
+from wearline_reconstruct.core.looking import any_stripes, drawn
+from wearline_reconstruct.core.stripes import strip_image
 from wearline_reconstruct.drivers.pictures import read_picture
 
 
@@ -277,10 +275,7 @@ def _stripes_only(frames: Sequence[Path], is_vertical: bool, out: Path) -> int:
         except FrameError as error:
             print(f"wearline: {error}", file=sys.stderr)
             continue
-        strip = strip_image(picture, is_vertical)
-        scale = estimate_scale(strip)
-        peaks = stripe_peaks(strip, scale, settings.stripes)
-        found = fragments(peaks, scale, settings.stripes.average_px, settings.lines)
+        scale, found = any_stripes(strip_image(picture, is_vertical), settings.stripes, settings.lines)
         if not found.count:
             print(f"wearline: {path}: shows no stripes; check --orientation and exposure", file=sys.stderr)
             continue
@@ -293,23 +288,9 @@ def _stripes_only(frames: Sequence[Path], is_vertical: bool, out: Path) -> int:
             sigma_px=found.sigma_px,
             stripe=found.label.astype(np.int32),
         )
-        cv2.imwrite(str(out / f"{path.stem}_stripes.png"), _drawn(picture, found, row, col))
+        cv2.imwrite(str(out / f"{path.stem}_stripes.png"), drawn(picture, found, is_vertical))
         print(f"{path}: {found.count} stripes, {len(row)} points, width {scale.width_px:.1f} px")
     return 0
-
-
-def _drawn(picture: NDArray[Any], found: Fragments, row: NDArray[np.float32], col: NDArray[np.float32]) -> NDArray[Any]:
-    """The picture with each fragment in a colour of its own."""
-    grey = np.clip(picture.astype(np.float32) * 0.75, 0, 255).astype(np.uint8)
-    canvas = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
-    hue = (np.arange(found.count) * 67 % 180).astype(np.uint8)
-    colours = cv2.cvtColor(
-        np.stack([hue, np.full_like(hue, 255), np.full_like(hue, 255)], axis=1)[None], cv2.COLOR_HSV2BGR
-    )[0]
-    r = np.clip(np.rint(row), 0, canvas.shape[0] - 1).astype(np.int64)
-    c = np.clip(np.rint(col), 0, canvas.shape[1] - 1).astype(np.int64)
-    canvas[r, c] = colours[found.label]
-    return np.asarray(canvas)
 
 
 def _configure_bench(parser: ArgumentParser) -> None:

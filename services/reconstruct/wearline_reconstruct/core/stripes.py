@@ -141,6 +141,13 @@ def _measured_scale(sample: F32, width: float, pitch: float) -> tuple[float, flo
     return max(measured, 0.8), found
 
 
+def period_of(strip: Image, width: float) -> float:
+    """Distance of neighbouring stripes of a known width; infinite without one. [px]"""
+    sample = _averaged(strip, 7)[:: max(1, strip.shape[0] // 160)]
+    near = cv2.blur(sample, (_odd(width), 1))
+    return _period(near - cv2.blur(sample, (_odd(10.0 * width), 1)), width)
+
+
 def _period(rise: F32, width: float) -> float:
     """Distance of neighbouring stripes from the autocorrelation across the lines; infinite without one."""
     across = rise.shape[1]
