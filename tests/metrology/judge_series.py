@@ -162,9 +162,9 @@ def tasks(chosen: argparse.Namespace) -> Iterator[tuple[str, Callable[[], Result
                 for thickness in (0.2, 0.1):
                     key = f"flake/{thickness}/{light}/{number}"
                     yield key, partial(flake_result, thickness, light, number)
-        if number < chosen.good:
-            light = LIGHTS[number % 3]
-            yield f"good/{light}/{number}", partial(good_result, light, number)
+        for light in LIGHTS:
+            if 3 * number + LIGHTS.index(light) < chosen.good:
+                yield f"good/{light}/{number}", partial(good_result, light, number)
         if number < chosen.verdicts:
             yield f"verdict/{number}", partial(verdict_result, number)
 

@@ -12,7 +12,8 @@ over a whole region: spread of good parts, place on a slope, the registration it
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -36,8 +37,8 @@ class ComparisonSettings(Settings):
     region_significance: float = Field(default=1.645, ge=0)
     """A region counts when its mean exceeds the precision by this many standard uncertainties (one-sided 95 %)."""
     region_existence: float = Field(default=5.0, ge=0)
-    """And when its mean is this many standard uncertainties from zero: a part has hundreds of places where noise
-    could make a region."""
+    """And when the mean of a whole neighbourhood in it is this many standard uncertainties from zero: a part has
+    hundreds of places where noise could make a region, and cells that were picked for their size prove nothing."""
     correlation_px: float = Field(default=120.0, gt=0)
     """Distance along a line at which errors are no longer alike. [px]"""
     position_sigma_mm: float = Field(default=0.01, ge=0)
@@ -128,7 +129,7 @@ def part_cells(points: NDArray[np.float32], golden: Golden, cells: TemplateCells
     lines, along = golden.z_mm.shape
     blocks = -(-along // BLOCK)
     finite = np.isfinite(points).all(axis=1) if len(points) else np.zeros(0, bool)
-    line_f, row, col, z, sigma = points[finite].T.astype(np.float64)
+    line_f, row, col, z, sigma = (points if finite.all() else points[finite]).T.astype(np.float64)
     across, along_f = (col, row) if golden.is_vertical else (row, col)
     line, place = np.rint(line_f).astype(np.int64), np.rint(along_f).astype(np.int64)
     keep = (line >= 0) & (line < lines) & (place >= 0) & (place < along)
@@ -272,21 +273,23 @@ def compare(
     )
     noise2 = np.maximum(part.variance_mm2 - sigma_frame_mm**2, 0.1 * part.variance_mm2) + cells.noise_mm2
 
-    def residual(motion: Motion) -> tuple[F64, F64]:
-        expected, guess = _moved_template(golden, cells, part, place, motion, unit)
-        return part.z_mm - expected, guess
+    # Neighbouring cells of a line err alike: a part of them determines the motion as well as all.
+    step = max(1, int(np.count_nonzero(np.isfinite(part.z_mm))) // _CELLS_FOR_MOTION)
+    few_cells, few_part, few_place = thinned(cells, step), thinned(part, step), thinned(place, step)
+    few_sigma2 = (noise2 + cells.natural_mm2)[:, ::step]
 
-    def flat_residual(motion: Motion) -> tuple[F64, F64]:
-        deviation, guess = residual(motion)
-        return deviation.ravel(), np.sqrt(noise2 + cells.natural_mm2 + guess**2).ravel()
+    def residual(motion: Motion) -> tuple[F64, F64]:
+        expected, guess = _moved_template(golden, few_cells, few_part, few_place, motion, unit)
+        return (few_part.z_mm - expected).ravel(), np.sqrt(few_sigma2 + guess**2).ravel()
 
     flat_place = Cells(
-        place.x.ravel(), place.y.ravel(), place.height_mm.ravel(), place.slope_x.ravel(), place.slope_y.ravel(),
-        place.distance,
+        few_place.x.ravel(), few_place.y.ravel(), few_place.height_mm.ravel(), few_place.slope_x.ravel(),
+        few_place.slope_y.ravel(), few_place.distance,
     )  # fmt: skip
-    use = datum if datum is not None else np.ones(part.z_mm.shape, bool)
-    motion = register(flat_residual, flat_place, use.ravel(), registration, scale is not None, datum is not None)
-    deviation, guess = residual(motion)
+    use = np.ones(few_part.z_mm.shape, bool) if datum is None else datum[:, ::step]
+    motion = register(residual, flat_place, use.ravel(), registration, scale is not None, datum is not None)
+    expected, guess = _moved_template(golden, cells, part, place, motion, unit)
+    deviation = part.z_mm - expected
 
     own = settings.position_sigma_mm if scale else settings.position_sigma_mm * 10.0
     common2 = cells.natural_mm2 + motion.place_sigma(place, own) ** 2 + motion.height_sigma_mm**2
@@ -301,6 +304,20 @@ def compare(
     label, regions = _regions(deviation, doubt, sigma, cells, precision_mm, floor_px, scale, settings)
     seen = np.minimum(part.seen, cells.expected)
     return Comparison(deviation, sigma, doubt, cells.area_px, label, cells.expected, seen, regions, motion)
+
+
+_CELLS_FOR_MOTION = 1500
+_Grids = TypeVar("_Grids", TemplateCells, PartCells, Cells)
+
+
+def thinned(grids: _Grids, step: int) -> _Grids:
+    """Every so many blocks of all arrays (line, block)."""
+    blocks = {
+        entry.name: getattr(grids, entry.name)[:, ::step]
+        for entry in fields(grids)
+        if isinstance(getattr(grids, entry.name), np.ndarray) and entry.name != "wanted"
+    }
+    return replace(grids, **blocks)
 
 
 def _moved_template(
@@ -341,7 +358,7 @@ def point_deviation(golden: Golden, part: LineGrid, motion: Motion) -> F64:
 _TILE = (29, 9)
 """Blocks along and lines across of the tiles over which scatter is judged: 230 px, so that light on half of a
 picture is seen, and large against a flake, whose edges are scatter too."""
-_SCATTER_PRIOR = 60.0
+_SCATTER_PRIOR = 30.0
 """Cells that the scatter of the whole part counts for against those of a tile."""
 _MEDIAN_OF_SQUARE = 0.4549
 """Of a normal deviate of variance 1."""
@@ -361,6 +378,8 @@ def _scatter(deviation: F64, noise2: F64, rest2: F64) -> F64:
     with np.errstate(invalid="ignore", divide="ignore"):
         # Where other doubts rule, scatter says little about noise.
         ratio = np.where(stated > 1.5 * other, bent * bent / stated, np.nan)
+    # Errors are alike over many blocks: every other one says as much.
+    ratio[:, 1::2] = np.nan
     usable = ratio[np.isfinite(ratio)]
     if usable.size < 100:
         return np.ones((lines, blocks))
@@ -381,52 +400,76 @@ def _scatter(deviation: F64, noise2: F64, rest2: F64) -> F64:
 
 _AROUND = (9, 2)
 """Blocks along and lines across of the neighbourhood whose mean may start a region: some 7 x 8 mm."""
+_ANCHOR = (_AROUND[0] // 2, 0)
+"""A window reaches from its line to the next one."""
 _GROWN = 1.5
 """A region takes in neighbours that deviate by the precision and by this many standard uncertainties."""
 
 
+@dataclass(frozen=True)
+class _Windows:
+    """Means over the neighbourhood windows that begin at each cell."""
+
+    mean_mm: NDArray[np.float32]
+    sigma_mm: NDArray[np.float32]
+    precision_mm: NDArray[np.float32]
+    is_whole: Bool
+    """Most of the window was seen."""
+
+    def around(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Per cell, the largest value of all windows that hold it."""
+        anchor = (_AROUND[0] - 1 - _ANCHOR[0], _AROUND[1] - 1 - _ANCHOR[1])
+        return np.asarray(cv2.dilate(values, np.ones((_AROUND[1], _AROUND[0]), np.uint8), anchor=anchor))
+
+    def best(self, sign: float) -> NDArray[np.float32]:
+        """Per cell, by how many standard uncertainties the best window that holds it deviates this way."""
+        score = np.where(self.is_whole, sign * self.mean_mm / np.maximum(self.sigma_mm, 1e-9), 0.0)
+        return self.around(score.astype(np.float32))
+
+
+def _windows(deviation: F64, doubt: Doubt, seen: Bool, precision: F64) -> _Windows:
+    total = _AROUND[0] * _AROUND[1]
+    lag = np.abs(np.subtract.outer(np.arange(_AROUND[0]), np.arange(_AROUND[0]))) * BLOCK / doubt.correlation_px
+    alike = float(np.mean(np.clip(1.0 - lag, 0.0, None))) / _AROUND[1]
+    spread2 = alike * doubt.noise_mm**2 + doubt.guess_mm**2 / _AROUND[1] + doubt.common_mm**2
+
+    def summed(values: F64) -> NDArray[np.float32]:
+        known = np.where(seen, values, 0.0).astype(np.float32)
+        border = cv2.BORDER_CONSTANT
+        return np.asarray(cv2.boxFilter(known, -1, _AROUND, anchor=_ANCHOR, normalize=False, borderType=border))
+
+    count = summed(np.ones(deviation.shape))
+    some = np.maximum(count, np.float32(1.0))
+    # Of a window at the edge of what was seen less is known.
+    sigma = np.sqrt(summed(spread2) / some * (np.float32(total) / some))
+    mean, level = (np.asarray(summed(v) / some, np.float32) for v in (deviation, precision))
+    return _Windows(mean, np.asarray(sigma, np.float32), level, count > 0.6 * total)
+
+
 def _starts(
-    deviation: F64, doubt: Doubt, sigma: F64, precision: F64, settings: ComparisonSettings
+    deviation: F64, sigma: F64, seen: Bool, windows: _Windows, precision: F64, settings: ComparisonSettings
 ) -> tuple[Bool, Bool]:
     """Cells that start a region, and cells that may belong to one."""
     with np.errstate(invalid="ignore"):
         size = np.abs(deviation)
         starts = size > np.maximum(precision, settings.cell_significance * sigma)
         member = size > np.maximum(precision, _GROWN * sigma)
-    seen = np.isfinite(deviation) & np.isfinite(sigma)
-    weight = seen.astype(np.float32)
-    total = _AROUND[0] * _AROUND[1]
-    lag = np.abs(np.subtract.outer(np.arange(_AROUND[0]), np.arange(_AROUND[0]))) * BLOCK / settings.correlation_px
-    alike = float(np.mean(np.clip(1.0 - lag, 0.0, None))) / _AROUND[1]
-    spread2 = alike * doubt.noise_mm**2 + doubt.guess_mm**2 / _AROUND[1] + doubt.common_mm**2
-    # The window of two lines reaches from a line to the next one.
-    anchor = (_AROUND[0] // 2, 0)
-    count = cv2.boxFilter(weight, -1, _AROUND, anchor=anchor, normalize=False, borderType=cv2.BORDER_CONSTANT)
-
-    def mean(values: F64) -> NDArray[np.float32]:
-        known = np.where(seen, values, 0.0).astype(np.float32)
-        summed = cv2.boxFilter(known, -1, _AROUND, anchor=anchor, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray(summed / np.maximum(count, np.float32(1.0)), np.float32)
-
-    around = mean(deviation)
-    spread = np.sqrt(mean(spread2))
-    whole = count > 0.8 * total
-    level = mean(precision)
-    back = (_AROUND[0] - 1 - anchor[0], _AROUND[1] - 1 - anchor[1])
+    needed = np.maximum(windows.precision_mm, np.float32(settings.cell_significance) * windows.sigma_mm)
     for sign in (1.0, -1.0):
-        found = whole & (sign * around > np.maximum(level, settings.cell_significance * spread))
+        found = windows.is_whole & (np.float32(sign) * windows.mean_mm > needed)
         if found.any():
-            reached = cv2.dilate(found.astype(np.uint8), np.ones((_AROUND[1], _AROUND[0]), np.uint8), anchor=back)
-            starts |= (reached > 0) & (sign * np.nan_to_num(deviation) > precision)
-            member |= starts
-    return starts & seen, member & seen
+            reached = windows.around(found.astype(np.float32)) > 0
+            starts |= reached & (sign * np.nan_to_num(deviation) > precision)
+    return starts & seen, (member | starts) & seen
 
 
 def _regions(
     deviation: F64, doubt: Doubt, sigma: F64, cells: TemplateCells, precision: F64, floor_px: float,
     scale: float | None, settings: ComparisonSettings,
 ) -> tuple[NDArray[np.int32], tuple[Region, ...]]:  # fmt: skip
-    starts, member = _starts(deviation, doubt, sigma, precision, settings)
+    seen = np.isfinite(deviation) & np.isfinite(sigma)
+    windows = _windows(deviation, doubt, seen, precision)
+    starts, member = _starts(deviation, sigma, seen, windows, precision, settings)
     label = np.zeros(deviation.shape, np.int32)
     if not starts.any():
         return label, ()
@@ -439,10 +482,13 @@ def _regions(
             continue
         begun = np.bincount(raw[starts & own], minlength=count) > 0
         sizes = np.bincount(raw.ravel(), weights=area.ravel(), minlength=count)
+        best = windows.best(sign)
         for index in range(1, count):
             if not begun[index] or sizes[index] < floor_px or sizes[index] <= 0:
                 continue
             at = raw == index
+            if float(best[at].max()) < settings.region_existence:
+                continue
             region = _region(at, deviation, doubt, cells, precision, scale, settings)
             if region is not None:
                 found.append((region, at))
@@ -462,7 +508,7 @@ def _region(
     mean = float(np.sum(np.abs(values) * weight) / size)
     uncertainty = doubt.of_mean(at, cells.area_px)
     limit = float(np.sum(precision[at] * weight) / size)
-    if mean - limit < settings.region_significance * uncertainty or mean < settings.region_existence * uncertainty:
+    if mean - limit < settings.region_significance * uncertainty:
         return None
     half = np.sqrt(weight) / 2.0
     xs, ys = cells.x_px[at], cells.y_px[at]

@@ -142,8 +142,11 @@ def _in_plane(cells: Cells) -> F64:
 def _solve(design: F64, target: F64, weight: F64) -> F64:
     scaled = design * weight[:, None]
     normal = scaled.T @ design
-    # A part seen on one line alone leaves a tilt open: the pseudo-inverse leaves it at zero.
-    return np.asarray(np.linalg.pinv(normal, rcond=1e-9, hermitian=True) @ (scaled.T @ target))
+    # A part seen on one line alone leaves a tilt open: what is not determined stays at zero.
+    values, vectors = np.linalg.eigh(normal)
+    known = values > 1e-9 * values[-1]
+    share = np.where(known, (vectors.T @ (scaled.T @ target)) / np.where(known, values, 1.0), 0.0)
+    return np.asarray(vectors @ share)
 
 
 def _weight(sigma: F64) -> F64:
