@@ -13,7 +13,7 @@ from wearline.cli import Command
 from wearline.config import CellSettings, load_cell, validated
 from wearline.errors import UsageError
 from wearline_judge.config import JudgeSettings
-from wearline_judge.drivers.backup import count_rows, opened, restore, write_backup
+from wearline_judge.drivers.backup import SERVICES, count_rows, opened, restore, write_backup
 from wearline_judge.drivers.lock import FolderLock
 from wearline_judge.drivers.records import open_engine, sqlite_url
 from wearline_judge.service import open_records
@@ -77,11 +77,11 @@ def _set_aside(cell: CellSettings) -> Path | None:
     try:
         stamp = f"before-restore-{datetime.now(UTC):%Y%m%dT%H%M%S%f}"
         aside = cell.data_dir / stamp
-        for path in sorted(cell.data_dir.iterdir()):
-            if path.name.startswith("before-restore-") or path.name in ("capture", "reconstruct"):
+        for path in (cell.data_dir / service for service in SERVICES):
+            if not path.is_dir():
                 continue
-            for kept in sorted(path.iterdir()) if path.name == "judge" else (path,):
-                if path.name == "judge" and kept.name in ("frames", "lock", "reserve"):
+            for kept in sorted(path.iterdir()) if path == folder else (path,):
+                if path == folder and kept.name in ("frames", "lock", "reserve"):
                     continue
                 target = aside / kept.relative_to(cell.data_dir)
                 target.parent.mkdir(parents=True, exist_ok=True)

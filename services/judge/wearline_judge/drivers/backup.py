@@ -30,6 +30,8 @@ FORMAT = "wearline.backup.v1"
 _MANIFEST = "manifest.json"
 _RECORDS = "judge/records.db"
 _SQLITE = b"SQLite format 3\0"
+SERVICES = ("fieldbus", "hmi", "judge")
+"""Whose folders hold what cannot be made again."""
 _LEFT_OUT = ("-wal", "-shm", ".lock")
 _AT_ONCE = 2000
 
@@ -119,14 +121,14 @@ def write_backup(
 
 
 def _stage(staged: Path, data_dir: Path) -> None:
-    """Copy every service's files, but for frames, caches and the judge's own database."""
+    """Copy the files of `SERVICES`, but for frames and the judge's own database."""
     (staged / "judge").mkdir(parents=True)
     for path in sorted(data_dir.rglob("*")):
         name = path.relative_to(data_dir)
         is_judge = name.parts[0] == "judge"
         if not path.is_file() or path.is_symlink() or path.name.endswith(_LEFT_OUT) or path.name.startswith("."):
             continue
-        if name.parts[0] in ("reconstruct", "capture") or (is_judge and name.parts[1] in ("frames", "reserve", "lock")):
+        if name.parts[0] not in SERVICES or (is_judge and name.parts[1] in ("frames", "reserve", "lock")):
             continue
         if is_judge and name.parts[1].startswith("records.db"):
             continue
