@@ -94,9 +94,10 @@ class Frame:
         with Element("header").classes("top"):
             _glance(self)
             _menu(self, screen)
-        with Element("main").classes("screen").props('id="content" tabindex="-1"') as main:
+        # The framework's page is the main landmark already.
+        with Element("div").classes("screen").props('tabindex="-1"') as content:
             screen.build(self)
-        ui.skip_link(say("Skip to content"), target=main)
+        ui.skip_link(say("Skip to content"), target=content)
         self._renew()
         self._timer = ui.timer(REFRESH_S, self._renew)
 

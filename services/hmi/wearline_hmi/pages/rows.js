@@ -1,7 +1,7 @@
 // A plain table of texts and signs (colour, shape and word); rows can be chosen by pointer or keyboard.
 export default {
   template: `
-    <div class="rows" tabindex="0" role="region" :aria-label="caption">
+    <div class="rows" tabindex="0" role="group" :aria-label="caption">
       <table>
         <caption class="hidden-text">{{ caption }}</caption>
         <thead><tr><th v-for="c in columns" :key="c.key" scope="col" :class="{number: c.number}">{{ c.label }}</th></tr></thead>

@@ -17,6 +17,7 @@ from wearline.errors import ConfigError, WearlineError
 from wearline_hmi.core import rights
 from wearline_hmi.drivers.accounts import Accounts
 from wearline_hmi.drivers.hashing import Hasher
+from wearline_hmi.pages.api import make_api
 from wearline_hmi.pages.camera import build_camera
 from wearline_hmi.pages.frame import Site
 from wearline_hmi.pages.gate import Doorkeeper, Gate, add_gate
@@ -141,6 +142,7 @@ def make_app(service: HmiService, keeper: Doorkeeper) -> FastAPI:
     site.add("/users", "Users", rights.LOOK_AT_USERS, build_users)
     add_export(app, site)
     add_log_export(app, site)
+    app.mount("/api", make_api(site))
     run.process_pool_start_method = "spawn"
     core.sio.eio.cors_allowed_origins = []
     ui.run_with(
