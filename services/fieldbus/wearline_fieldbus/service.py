@@ -27,12 +27,25 @@ from wearline.messages import (
     Records,
     ResultCode,
     SelectObject,
+    ServiceState,
     SetMode,
     Verdict,
 )
 from wearline.metrics import counter, gauge, histogram
 from wearline.service import Asker, Health, Service
-from wearline.topics import DO_MEASURE, EXPOSED, JOURNAL, MODE, RECIPE, RECORDS, SELECT_OBJECT, VERDICT, Query, Topic
+from wearline.topics import (
+    DO_MEASURE,
+    EXPOSED,
+    JOURNAL,
+    MODE,
+    RECIPE,
+    RECORDS,
+    SELECT_OBJECT,
+    STATES,
+    VERDICT,
+    Query,
+    Topic,
+)
 from wearline_fieldbus.config import FieldbusSettings
 from wearline_fieldbus.core import cycle as c
 from wearline_fieldbus.core.extended import ExtendedHandshake
@@ -92,6 +105,7 @@ class Fieldbus(Service):
         self._image = bytes(profile.size)
         self._image_at_s: float | None = None
         self._has_room = True
+        self._judge_accepts = True
         self._room_at_s = 0.0
         self._unrecorded: list[Outcome] = []
         self._later: list[Message] = []
@@ -121,7 +135,7 @@ class Fieldbus(Service):
         self._link.start()
 
     def handlers(self) -> Mapping[Topic, Callable[[Any], Iterable[Message]]]:
-        return {VERDICT: self.on_verdict, EXPOSED: self.on_exposed}
+        return {VERDICT: self.on_verdict, EXPOSED: self.on_exposed, STATES["judge"]: self.on_judge_state}
 
     def answers(self) -> Mapping[Query, Callable[[Any], Message]]:
         return {
@@ -140,6 +154,11 @@ class Fieldbus(Service):
     def on_exposed(self, exposed: Exposed) -> Iterator[Message]:
         """The picture is taken: the part may move."""
         yield from self._feed(c.ExposureEnded(exposed.cycle_id))
+
+    def on_judge_state(self, state: ServiceState) -> Iterator[Message]:
+        """Judge says whether it could record another cycle; its records may lie on another disk."""
+        self._judge_accepts = state.values.get("accepts") is not False
+        yield from self._look_at_disk()
 
     def on_alive(self, service: str, is_alive: bool) -> Iterator[Message]:
         yield from self._feed(c.ServiceChanged(service, is_alive))
@@ -302,6 +321,7 @@ class Fieldbus(Service):
                 has_room = False
             else:
                 del self._unrecorded[0]
+        has_room = has_room and self._judge_accepts
         if has_room is self._has_room:
             return
         self._has_room = has_room

@@ -148,6 +148,21 @@ def test_a_disk_without_room_withdraws_ready_and_says_so(rig: Rig, monkeypatch: 
     assert [e.level for e in rig.of(m.Event)] == ["error", "info"]
 
 
+def test_a_judge_that_cannot_record_withdraws_ready(rig: Rig) -> None:
+    def judge(**values: bool) -> m.ServiceState:
+        return m.ServiceState(service="judge", status="ready", pid=1, uptime_s=1.0, version="0", values=dict(values))
+
+    ready(rig)
+    rig.take(rig.service.on_judge_state(judge(accepts=True)))
+    assert rig.of(m.Event) == []
+    rig.take(rig.service.on_judge_state(judge(accepts=False)))
+    rig.until(lambda: not rig.shown("ready"))
+    assert "no room on disk" in rig.of(m.Event)[-1].text
+    # A judge of an older version says nothing of it.
+    rig.take(rig.service.on_judge_state(judge()))
+    rig.until(lambda: bool(rig.shown("ready")))
+
+
 def test_an_entry_that_fails_is_told_to_the_plc_as_code_20(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     ready(rig)
 
