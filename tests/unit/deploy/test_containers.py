@@ -85,6 +85,12 @@ def test_no_secret_and_no_download_outlives_the_build() -> None:
     assert copied == ["COPY --from=build /opt/wearline /opt/wearline"]
 
 
+def test_what_is_installed_into_a_stage_that_runs_leaves_no_lists_behind() -> None:
+    (line,) = (line for line in stages()["base"] if "apt-get install" in line)
+    assert line.index("rm -rf /var/lib/apt/lists/* /var/cache/apt/*") > line.index("apt-get install")
+    assert not any("apt-get" in line for stage in ("service", "prometheus") for line in stages()[stage])
+
+
 def test_third_party_packages_come_by_hash_alone() -> None:
     installer = (DEPLOY / "install.sh").read_text(encoding="utf-8").replace("\\\n", " ")
     installs = re.findall(r"^ *pip [^#\n]*\binstall\b[^\n]*", installer, re.MULTILINE)
