@@ -38,7 +38,7 @@ bench: .venv/ready-run ## Speed and precision against known truth
 wear-forecast: .venv/ready-dev ## Forecasts on 1000 simulated dies beside a straight line and an EWMA rule
 	@.venv/bin/python -m tests.metrology.wear_series $(N)
 
-kills: .venv/ready-dev ## 20 kill -9 while strokes run (long)
+kills: .venv/ready-dev ## 20 kill -9 and 7 hung services while strokes run (long)
 	@.venv/bin/python -m pytest -m slow tests/faults $(T)
 
 mutations: .venv/ready-dev ## Break the product on purpose and see a test go red; T=word picks some (long)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from pathlib import Path
 
 import pytest
@@ -45,6 +47,35 @@ def kill_in_turn(folder: Path, taught: Path, victims: list[str], capsys: pytest.
 
 def test_each_service_may_die(tmp_path: Path, taught: Path, capsys: pytest.CaptureFixture[str]) -> None:
     kill_in_turn(tmp_path, taught, list(SERVICES), capsys)
+
+
+HANGS_S = 3.5
+"""Longer than the PLC waits, so that what the service does when it goes on is too late. [s]"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_each_service_may_hang(tmp_path: Path, taught: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """SIGSTOP in the middle of a cycle: what comes out of a service that was hung is never believed of another part."""
+    back_s: list[tuple[str, float]] = []
+    with SimulatedCell(tmp_path, taught, first_stroke=WORN_AFTER + 1) as cell:
+        cell.wear_every_other_part()
+        cell.wait_until_measured(0.0, within_s=30.0, times=2)
+        for victim in ("judge", "reconstruct", "capture", "fieldbus", "judge", "reconstruct", "router"):
+            cell.wait_for_next(MeasureRequest)
+            cell.kill(victim, signal.SIGSTOP)
+            threading.Event().wait(HANGS_S)
+            on_s = cell.kill(victim, signal.SIGCONT)
+            back_s.append((victim, cell.wait_until_measured(on_s, within_s=30.0) - on_s))
+        cell.wait_until_measured(on_s, within_s=30.0, times=4)
+        books = cell.books()
+    assert books.audit() == []
+    assert all(seconds <= BACK_WITHIN_S for _, seconds in back_s), back_s
+    with capsys.disabled():
+        print(
+            f"\n{len(back_s)} hangs of {HANGS_S:g} s, {len(books.journal)} accepted; measuring again after "
+            f"{max(seconds for _, seconds in back_s):.1f} s at most"
+        )
 
 
 @pytest.mark.slow
