@@ -17,12 +17,13 @@ from wearline.artifact import Calibration, Template
 from wearline.cli import Command, progress
 from wearline.errors import CalibrationError, FrameError, UsageError
 from wearline.messages import LinePoints
-from wearline.offline import Chain, read_frame
+from wearline.offline import Chain, oriented, read_frame
 from wearline.recipe import Recipe, load_recipe
 from wearline.surface import dense_map
 from wearline_reconstruct.config import ReconstructSettings
 from wearline_reconstruct.core.calibration import CalibrationSettings, Shot, calibrate
-from wearline_reconstruct.core.chain import prepare
+from wearline_reconstruct.core.chain import Reconstruction, prepare, reconstruct
+from wearline_reconstruct.core.hdr import MOST_EXPOSURES
 from wearline_reconstruct.core.lateral import Target, distance_mm, find_target, fit_lateral, positions_mm, scale_of
 from wearline_reconstruct.core.looking import any_stripes, drawn
 from wearline_reconstruct.core.stripes import strip_image
@@ -175,6 +176,10 @@ def _configure_reconstruct(parser: ArgumentParser) -> None:
     parser.add_argument("--template", type=Path, metavar="T.npz", help="gates the line numbers")
     parser.add_argument("--stripes-only", action="store_true", help="only find the stripes; needs no calibration")
     parser.add_argument("--orientation", choices=("horizontal", "vertical"), help="with --stripes-only")
+    parser.add_argument(
+        "--bracket", type=int, metavar="N",
+        help="each N (2 or 3) frames that follow each other are exposures of one part at rest, measured as one",
+    )  # fmt: skip
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
 
 
@@ -204,10 +209,51 @@ def _run_reconstruct(arguments: Namespace) -> int:
         raise UsageError("goes with --stripes-only", "--orientation", "the calibration knows it")
     recipe = load_recipe(arguments.recipe)
     calibration = Calibration.load(arguments.calibration)
+    exposures = _exposures(arguments.bracket, len(frames), recipe)
     template = Template.load(arguments.template) if arguments.template else None
     prepare(calibration, recipe, template)
     arguments.out.mkdir(parents=True, exist_ok=True)
+    if exposures > 1:
+        return _bracketed(frames, exposures, oriented(recipe, calibration), calibration, template, arguments.out)
     return _heights(frames, recipe, calibration, template, arguments.out)
+
+
+def _exposures(bracket: int | None, frames: int, recipe: Recipe) -> int:
+    """How many frames make one part."""
+    if bracket is None:
+        if recipe.hdr == "bracket":
+            raise UsageError(
+                "asks for a bracket of exposures", "hdr of the recipe", "say with --bracket 2 or 3 how many a part has"
+            )
+        return 1
+    if not 2 <= bracket <= MOST_EXPOSURES:
+        raise UsageError(f"{bracket} exposures cannot be merged", "--bracket", "give 2 or 3")
+    if frames % bracket:
+        raise UsageError(f"{frames} frames are not whole brackets of {bracket}", "--bracket", "name all exposures")
+    return bracket
+
+
+def _bracketed(
+    frames: Sequence[Path], count: int, recipe: Recipe, calibration: Calibration, template: Template | None, out: Path
+) -> int:
+    """Exposures of parts at rest, ``count`` frames each; files are named after the first of them."""
+    if recipe.hdr == "off":
+        recipe = recipe.model_copy(update={"hdr": "bracket"})
+    prepared = prepare(calibration, recipe, template, ReconstructSettings().chain)
+    for first in progress(range(0, len(frames), count), "reconstruct", len(frames) // count):
+        paths = frames[first : first + count]
+        start = time.perf_counter()
+        try:
+            pictures = [read_frame(path) for path in paths]
+            decoded = time.perf_counter()
+            found = reconstruct(pictures, prepared, time.perf_counter)
+        except FrameError as error:
+            where = "" if error.where else f"{paths[0]}: "
+            print(f"wearline: {where}{error}", file=sys.stderr)
+            continue
+        _save_heights(out / f"{paths[0].stem}.npz", found, calibration, recipe, 1e3 * (decoded - start))
+        _tell(paths[0], found, out)
+    return 0
 
 
 def _heights(
@@ -228,13 +274,21 @@ def _heights(
                 print(f"wearline: {path}: {found.refusal}", file=sys.stderr)
                 continue
             _save_heights(out / f"{path.stem}.npz", found, calibration, recipe, 1e3 * (decoded - start))
-            print(f"{path}: {len(found.points)} points, coverage {found.coverage:.3f}, {out / path.stem}.npz")
+            _tell(path, found, out)
     finally:
         chain.close()
     return 0
 
 
-def _save_heights(path: Path, found: LinePoints, calibration: Calibration, recipe: Recipe, decode_ms: float) -> None:
+def _tell(path: Path, found: LinePoints | Reconstruction, out: Path) -> None:
+    print(f"{path}: {len(found.points)} points, coverage {found.coverage:.3f}, {out / path.stem}.npz")
+    for sentence in found.quality.sentences:
+        print(f"  {sentence}")
+
+
+def _save_heights(
+    path: Path, found: LinePoints | Reconstruction, calibration: Calibration, recipe: Recipe, decode_ms: float
+) -> None:
     start = time.perf_counter()
     rows, cols = (int(v) for v in calibration.image_shape)
     surface = dense_map(

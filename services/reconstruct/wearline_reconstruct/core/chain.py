@@ -6,7 +6,7 @@ depend on the frame, `reconstruct` does the rest.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -16,6 +16,7 @@ from wearline.artifact import Calibration, Template
 from wearline.errors import CalibrationError, FrameError
 from wearline.messages import FrameQuality, ResultCode
 from wearline.recipe import Recipe
+from wearline_reconstruct.core.hdr import flank_centres, merged_peaks
 from wearline_reconstruct.core.heights import across_at, height_slope, heights
 from wearline_reconstruct.core.lines import Fragments, LineSettings, fragments
 from wearline_reconstruct.core.numbering import (
@@ -35,6 +36,7 @@ from wearline_reconstruct.core.stripes import (
     I64,
     Bool,
     Image,
+    Peaks,
     Scale,
     StripeSettings,
     strip_image,
@@ -169,11 +171,13 @@ def _spot_search(calibration: Calibration, pitch: float) -> Search | None:
     )
 
 
-def reconstruct(pixels: Image, prepared: Prepared, clock_s: Callable[[], float] | None = None) -> Reconstruction:
-    """Heights on the laser lines of one frame.
+def reconstruct(
+    pixels: Image | Sequence[Image], prepared: Prepared, clock_s: Callable[[], float] | None = None
+) -> Reconstruction:
+    """Heights on the laser lines of one frame, or of several exposures of a part at rest.
 
     Args:
-        pixels: uint8 [row, col], the full sensor.
+        pixels: uint8 [row, col], the full sensor; or two or three of them.
         prepared: from `prepare`.
         clock_s: a monotonic clock for `timings_ms`; None = no timings.
 
@@ -192,13 +196,8 @@ def reconstruct(pixels: Image, prepared: Prepared, clock_s: Callable[[], float] 
 
     calibration, settings = prepared.calibration, prepared.settings
     rows, cols = (int(v) for v in calibration.image_shape)
-    check_pixels(pixels, (rows, cols))
-    strip = strip_image(pixels, calibration.is_vertical)
+    strip, peaks = _peaks_of([pixels] if isinstance(pixels, np.ndarray) else pixels, (rows, cols), prepared)
     by_thesis = prepared.recipe.method == "thesis"
-    if by_thesis:
-        peaks = thesis_peaks(strip, prepared.scale, settings.stripes, settings.thesis)
-    else:
-        peaks = stripe_peaks(strip, prepared.scale, settings.stripes)
     lap("stripes")
     if by_thesis:
         found = thesis_fragments(peaks, prepared.scale, settings.thesis)
@@ -217,6 +216,36 @@ def reconstruct(pixels: Image, prepared: Prepared, clock_s: Callable[[], float] 
         result.quality,
         {**timings, "total": sum(timings.values())},
     )
+
+
+def _peaks_of(pictures: Sequence[Image], shape: tuple[int, int], prepared: Prepared) -> tuple[Image, Peaks]:
+    """The strip image that shows the spot best, and the peaks of all exposures."""
+    settings, scale = prepared.settings, prepared.scale
+    exposures: list[tuple[float, Image, Peaks]] = []
+    refusal: FrameError | None = None
+    for pixels in pictures:
+        try:
+            check_pixels(pixels, shape)
+        except FrameError as error:
+            # Of several exposures one may be too dark or too bright to show anything.
+            refusal = error
+            continue
+        strip = strip_image(pixels, prepared.calibration.is_vertical)
+        if prepared.recipe.method == "thesis":
+            peaks = thesis_peaks(strip, scale, settings.stripes, settings.thesis)
+        else:
+            peaks = stripe_peaks(strip, scale, settings.stripes)
+            if prepared.recipe.hdr != "off":
+                peaks = flank_centres(strip, peaks, scale, settings.stripes)
+        exposures.append((float(strip[::16, ::16].mean()), strip, peaks))
+    if refusal is not None and not exposures:
+        raise refusal
+    exposures.sort(key=lambda exposure: exposure[0])
+    if len(exposures) == 1:
+        return exposures[0][1:]
+    # The brightest exposure without much saturation: the spot stands out, and does not bloom.
+    calm = [e for e in exposures if float(np.mean(e[2].is_saturated)) < 0.1] or exposures[:1]
+    return calm[-1][1], merged_peaks([peaks for _, _, peaks in exposures], scale)
 
 
 def _numbered(strip: Image, found: Fragments, prepared: Prepared) -> tuple[I64, Spot | None]:
