@@ -232,6 +232,23 @@ def test_tables_of_a_newer_version_are_left_alone(database: Database) -> None:
     engine.dispose()
 
 
+def test_a_database_server_that_was_started_anew_costs_no_record(postgres: str, tmp_path: Path) -> None:
+    admin = open_engine(postgres)
+    name = f"anew_{abs(hash(str(tmp_path))):x}"
+    with admin.connect().execution_options(isolation_level="AUTOCOMMIT") as db:
+        db.execute(text(f'CREATE DATABASE "{name}"'))
+    store = filled(postgres.replace("/postgres?", f"/{name}?"), 2)
+    with admin.connect().execution_options(isolation_level="AUTOCOMMIT") as db:
+        ended = db.execute(
+            text("SELECT count(pg_terminate_backend(pid)) FROM pg_stat_activity WHERE datname = :name"), {"name": name}
+        )
+        assert ended.scalar() == 1
+    assert store.append_verdict(verdict(3), utc(3), 0.0)
+    assert [row.stroke for row in store.rows(AskRecords(last=9))] == [3, 2, 1]
+    store.close()
+    admin.dispose()
+
+
 def test_what_is_no_database_is_refused_with_its_place(tmp_path: Path) -> None:
     (tmp_path / "text.db").write_text("not a database" * 100)
     with pytest.raises(RecordError, match=r"text\.db.*file is not a database"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -308,6 +310,56 @@ def test_low_disk_withdraws_readiness_and_the_reserve_carries_what_is_under_way(
     assert cell.judge.health().values["accepts"] is False
     free["bytes"] = 2_000_000
     assert cell.judge.health().values["accepts"] is True and reserve.stat().st_size == 500_000
+
+
+@pytest.mark.slow
+def test_a_disk_that_is_really_full_costs_no_record(tmp_path: Path) -> None:
+    """On a file system of 12 MB, mounted for the test (needs root)."""
+    folder = tmp_path / "small"
+    folder.mkdir()
+    mount = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=12m", "wearline", str(folder)], capture_output=True)
+    if mount.returncode != 0:
+        pytest.skip("a file system cannot be mounted here")
+    cell: Cell | None = None
+    try:
+        cell = Cell(folder, settings=JudgeSettings(min_free_mb=0.5, reserve_mb=1.0))
+        assert cell.judge.health().values["accepts"] is True
+        filler = folder / "filler"
+        with contextlib.suppress(OSError), filler.open("wb", buffering=0) as file:
+            while True:
+                file.write(bytes(65536))
+        assert cell.judge.health().values["accepts"] is False
+        # What was accepted before is recorded all the same, by the reserve.
+        assert cell.judged(Part(flaw_mm=0.3), 1).decision is Decision.FAILED
+        list(cell.judge.on_outcome(outcome(1, 2)))
+        for stroke in range(2, 400):
+            if cell.judged(Part(), stroke).code == ResultCode.DISK:
+                break
+            list(cell.judge.on_outcome(outcome(stroke)))
+        else:
+            pytest.fail("the disk never filled up")
+        health = cell.judge.health()
+        assert stroke > 8 and health.status == "degraded" and health.values["unrecorded"] == 1
+        list(cell.judge.on_outcome(outcome(stroke, ResultCode.DISK)))
+        filler.unlink()
+        told = [m.text for m in cell.judge.tick(1e4) if isinstance(m, Event)]
+        assert any("2 entries" in text for text in told)
+        assert cell.judge.health().values["accepts"] is True
+        assert cell.records().total == stroke and cell.records().rows[0].told_code == ResultCode.DISK
+        assert len(list(cell.stores.records.verified())) == 2 * stroke
+    finally:
+        if cell is not None:
+            cell.judge.close()
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+def test_records_beyond_the_quota_are_pruned_and_the_chain_still_verifies(make: Callable[..., Cell]) -> None:
+    cell = make(settings=JudgeSettings(records_kept=3))
+    for stroke in range(1, 6):
+        cell.judged(Part(), stroke)
+    list(cell.judge.tick(200.0))
+    assert [row.stroke for row in cell.records().rows] == [5, 4, 3] and cell.records().total == 5
+    assert [entry.number for entry in cell.stores.records.verified()] == [3, 4, 5]
 
 
 def test_the_outcome_completes_the_record(cell: Cell) -> None:

@@ -88,8 +88,12 @@ def open_engine(url: str) -> Engine:
         raise ConfigError("is no database URL", "judge.records_url", "write sqlite:/// or postgresql://") from error
     if name not in ("sqlite", "postgresql"):
         raise ConfigError(f"{name} is not supported", "judge.records_url", "write sqlite:/// or postgresql://")
-    options: dict[str, Any] = {"timeout": _WAIT_S} if name == "sqlite" else {"connect_timeout": 2}
-    engine = create_engine(url, connect_args=options, pool_size=2, max_overflow=2)
+    options: dict[str, Any] = {"timeout": _WAIT_S}
+    if name == "postgresql":
+        # A server that went away without a word must cost one verdict, not a cell.
+        options = {"connect_timeout": 2, "tcp_user_timeout": int(1e3 * _WAIT_S)}
+    # A connection that a restarted server has forgotten is noticed before it is used.
+    engine = create_engine(url, connect_args=options, pool_size=2, max_overflow=2, pool_pre_ping=name == "postgresql")
 
     @event.listens_for(engine, "connect")
     def connected(connection: Any, _: Any) -> None:
