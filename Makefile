@@ -34,6 +34,10 @@ format: .venv/ready-dev ## Let ruff format the tree
 bench: .venv/ready-run ## Speed and precision against known truth
 	@.venv/bin/wearline bench
 
+.PHONY: judge-series
+judge-series: .venv/ready-dev ## Flakes, good parts and verdicts on hundreds of rendered parts (long, resumes); N="--good 200" limits
+	@nice -n 10 .venv/bin/python -m tests.metrology.judge_series $(N)
+
 .PHONY: wear-forecast
 wear-forecast: .venv/ready-dev ## Forecasts on 1000 simulated dies beside a straight line and an EWMA rule
 	@.venv/bin/python -m tests.metrology.wear_series $(N)
