@@ -126,3 +126,14 @@ def test_worn_area_and_mean_are_those_of_the_truth() -> None:
     assert judged.fields["mean_error_mm"] == pytest.approx(mean, abs=0.02)
     assert judged.fields["deviating_area_mm2"] == pytest.approx(0.01 * float(np.sum(area)), rel=0.15)
     assert judged.fields["wear_mm"] == pytest.approx(float(np.percentile(np.abs(truth[at]), 95)), abs=0.02)
+
+
+def test_light_on_half_of_the_picture_is_no_defect() -> None:
+    comparison = compared(bench().judge(Refixtured(PART, Pose(0.1, 0.1, 0.05)), "half", 68))
+    deviation = comparison.deviation_mm
+    middle = deviation.shape[1] // 2
+    assert comparison.regions == ()
+    assert float(np.nanmax(np.abs(deviation))) < 0.5
+    # Each half is as good as in even light of its kind.
+    assert float(np.nanstd(deviation[:, : middle - 3])) < 0.026
+    assert float(np.nanstd(deviation[:, middle + 3 :])) < 0.05

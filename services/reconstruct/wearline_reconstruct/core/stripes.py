@@ -196,6 +196,20 @@ def _background_noise(rise: Image, near: Image, width: float) -> float:
     return max(float(np.median(np.abs(second))) / (0.6745 * 1.2247), 0.15)
 
 
+_BANDS = 6
+
+
+def _ruling_noise(rise: Image, near: Image, width: float) -> float:
+    """Noise of the noisiest band along the lines: where light falls on a part of the picture, settings for the dark
+    rest would take texture for stripes; those for the bright part cost the dark one little."""
+    whole = _background_noise(rise, near, width)
+    if len(rise) < 10 * _BANDS:
+        return whole
+    bands = zip(np.array_split(rise, _BANDS), np.array_split(near, _BANDS), strict=True)
+    # Bands scatter: in even light the whole picture knows best.
+    return max(whole, 0.9 * max(_background_noise(r, n, width) for r, n in bands))
+
+
 def _runs(mask: NDArray[np.uint8]) -> tuple[I64, I64, I64]:
     """Runs of what is not 0 along the last axis: row, first and one past last. Blanks the first and last column."""
     mask[:, 0] = 0
@@ -214,7 +228,7 @@ def background_offset(near: Image, scale: Scale, settings: StripeSettings) -> tu
     window = _odd(min(pitch, max(14.0 * scale.width_px, 9.0)))
     around = cv2.blur(near, (window, 1), borderType=cv2.BORDER_REFLECT_101)
     sparse = near[::23].astype(np.float32)
-    noise = _background_noise(sparse - around[::23], sparse, scale.width_px)
+    noise = _ruling_noise(sparse - around[::23], sparse, scale.width_px)
     return around, max(settings.threshold_noise * noise, settings.threshold_dn), noise
 
 
