@@ -18,7 +18,7 @@ from wearline.surface import dense_map
 from wearline_judge.commands.stored import OF_THE_FRAME, StoredCell, stored_cell
 from wearline_judge.config import JudgeSettings
 from wearline_judge.core.pictures import colours, ply, tiff16
-from wearline_judge.drivers.report import Picture, write_report
+from wearline_judge.drivers.part_report import Picture, write_report
 from wearline_judge.drivers.tables_io import read_cycles, row_of, write_csv, write_parquet
 from wearline_judge.service import open_records
 
