@@ -8,6 +8,7 @@ from pydantic import Field
 
 from wearline.config import Settings
 from wearline_fieldbus.core.cycle import HandshakeSettings
+from wearline_fieldbus.core.profiles import PROFILES, Profile, remapped
 from wearline_fieldbus.core.soft_plc import SoftPlcSettings
 from wearline_fieldbus.drivers.journal import JournalSettings
 from wearline_fieldbus.drivers.s7 import S7Settings
@@ -44,3 +45,12 @@ class PlcSimSettings(SoftPlcSettings):
     db: int = Field(default=100, ge=1, le=65535)
     scan_ms: float = Field(default=10.0, ge=1, le=1000)
     """Between two scans of its program. [ms]"""
+
+
+def make_profile(settings: FieldbusSettings) -> Profile:
+    """The profile as cell.yaml has it.
+
+    Raises:
+        ConfigError: a remap that cannot be obeyed.
+    """
+    return remapped(PROFILES[settings.profile], settings.remap, settings.handshake.numbered, "fieldbus.remap")

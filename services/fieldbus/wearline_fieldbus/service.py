@@ -46,11 +46,11 @@ from wearline.topics import (
     Query,
     Topic,
 )
-from wearline_fieldbus.config import FieldbusSettings
+from wearline_fieldbus.config import FieldbusSettings, make_profile
 from wearline_fieldbus.core import cycle as c
 from wearline_fieldbus.core.extended import ExtendedHandshake
 from wearline_fieldbus.core.handshake import Handshake, Recovered
-from wearline_fieldbus.core.profiles import PROFILES, Direction, Profile, image_rows, remapped
+from wearline_fieldbus.core.profiles import Direction, Profile, image_rows
 from wearline_fieldbus.drivers.journal import Journal as JournalFile
 from wearline_fieldbus.drivers.memory import MemoryPlc
 from wearline_fieldbus.drivers.plc import (
@@ -383,15 +383,6 @@ class Fieldbus(Service):
 
 def _utc() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
-
-
-def make_profile(settings: FieldbusSettings) -> Profile:
-    """The profile as cell.yaml has it.
-
-    Raises:
-        ConfigError: a remap that cannot be obeyed.
-    """
-    return remapped(PROFILES[settings.profile], settings.remap, settings.handshake.numbered, "fieldbus.remap")
 
 
 def build(cell: CellSettings, settings: FieldbusSettings) -> Service:

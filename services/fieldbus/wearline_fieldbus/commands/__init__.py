@@ -1,8 +1,9 @@
-"""``wearline plc-sim``."""
+"""``wearline plc-sim`` and ``wearline plc-kit``."""
 
 from __future__ import annotations
 
 import logging
+import sys
 import time
 from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
@@ -10,11 +11,13 @@ from pathlib import Path
 
 from wearline.cli import Command
 from wearline.config import load_cell, validated
+from wearline.errors import UsageError
 from wearline.log import start_log
 from wearline.stop import StopSignal
-from wearline_fieldbus.config import PlcSimSettings
+from wearline_fieldbus.config import FieldbusSettings, PlcSimSettings, make_profile
 from wearline_fieldbus.core.profiles import PROFILES, Direction
 from wearline_fieldbus.core.soft_plc import SOFT_PLCS, SoftPlc
+from wearline_fieldbus.core.tia import kit
 from wearline_fieldbus.drivers.s7_server import S7Server
 from wearline_fieldbus.drivers.stroke_log import StrokeLog
 
@@ -72,3 +75,46 @@ PLC_SIM = Command(
     "plc-sim", "a simulated Siemens PLC with its press line, behind the real S7 protocol", _configure_plc_sim,
     _run_plc_sim,
 )  # fmt: skip
+
+
+def _configure_plc_kit(parser: ArgumentParser) -> None:
+    parser.add_argument("--profile", choices=tuple(PROFILES), help="default: as cell.yaml says, else basic")
+    parser.add_argument("--config", type=Path, metavar="CELL.yaml", help="a cell: its profile, remap and DB number")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+
+
+def _run_plc_kit(arguments: Namespace) -> int:
+    settings = FieldbusSettings()
+    if arguments.config is not None:
+        section = load_cell(arguments.config).fieldbus
+        settings = validated(FieldbusSettings, section, f"{arguments.config}: fieldbus")
+    if arguments.profile not in (None, settings.profile):
+        if settings.remap:
+            raise UsageError(
+                f"the remap of {arguments.config} is of profile {settings.profile}", f"--profile {arguments.profile}",
+                "leave --profile out",
+            )  # fmt: skip
+        settings = settings.model_copy(update={"profile": arguments.profile})
+    profile = make_profile(settings)
+    if not settings.handshake.numbered:
+        raise UsageError(
+            "a PLC that numbers nothing has no function block of ours", "handshake.numbered",
+            "number the measurements, or write the PLC's side yourself",
+        )  # fmt: skip
+    try:
+        files = dict(kit(profile, settings.plc.db, settings.plc.poll_ms))
+    except ValueError as error:
+        raise UsageError(f"no data type has this layout ({error})", "fieldbus.remap", "move the field") from error
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for name, text in files.items():
+        # TIA Portal reads UTF-8 with a byte order mark.
+        (arguments.out / name).write_text(
+            text, encoding="utf-8" if name.endswith(".md") else "utf-8-sig", newline="\r\n"
+        )
+        sys.stdout.write(f"{arguments.out / name}\n")
+    return 0
+
+
+PLC_KIT = Command(
+    "plc-kit", "data type, data block and function block for TIA Portal", _configure_plc_kit, _run_plc_kit
+)
