@@ -24,7 +24,7 @@ from wearline_fieldbus.drivers.plc import (
 from wearline_fieldbus.drivers.s7 import CONNECTION, RACK_SLOT, S7Plc, S7Settings
 from wearline_fieldbus.drivers.s7_server import S7Server
 
-TIMEOUT_S = 0.3
+TIMEOUT_S = 0.2
 LONGEST_S = 0.5
 """No operation may block longer."""
 
