@@ -42,6 +42,9 @@ judge-series: .venv/ready-dev ## Flakes, good parts and verdicts on hundreds of 
 wear-forecast: .venv/ready-dev ## Forecasts on 1000 simulated dies beside a straight line and an EWMA rule
 	@.venv/bin/python -m tests.metrology.wear_series $(N)
 
+browser: .venv/ready-dev ## The screens in Chromium, the long forms too
+	@.venv/bin/python -m pytest -m "slow or not slow" tests/browser $(T)
+
 kills: .venv/ready-dev ## 20 kill -9 and 7 hung services while strokes run (long)
 	@.venv/bin/python -m pytest -m slow tests/faults $(T)
 
@@ -73,4 +76,4 @@ constraints: .venv/ready-dev ## Pin all third-party packages anew
 clean: ## Forget the environment and the demo's data
 	rm -rf .venv run build
 
-.PHONY: help demo test lint format bench kills records-million kill-writers mutations images constraints clean plc-faults
+.PHONY: help demo test lint format bench browser kills records-million kill-writers mutations images constraints clean plc-faults

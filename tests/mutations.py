@@ -35,6 +35,7 @@ class Mutation:
 RECONSTRUCT = "services/reconstruct/wearline_reconstruct"
 JUDGE = "services/judge/wearline_judge"
 FIELDBUS = "services/fieldbus/wearline_fieldbus"
+HMI = "services/hmi/wearline_hmi"
 
 MUTATIONS: tuple[Mutation, ...] = (
     Mutation(
@@ -305,6 +306,84 @@ MUTATIONS: tuple[Mutation, ...] = (
         "        residual = (cloud - centre) @ normal\n",
         "        residual = cloud[:, 2] - centre[2] + 0.0 * normal[2]\n",
         ("tests/unit/judge/test_capability.py",),
+    ),
+    Mutation(
+        "a verdict whose outcome came first is not shown",
+        f"{HMI}/core/state.py",
+        "if state.verdict is not None and (index > 0 or",
+        "if state.verdict is not None and (True or",
+        ("tests/unit/hmi/test_state.py",),
+    ),
+    Mutation(
+        "an old verdict stays green on the screen",
+        f"{HMI}/core/words.py",
+        'replace(sign, colour="grey") if is_stale else sign',
+        "sign",
+        ("tests/unit/hmi/test_words.py",),
+    ),
+    Mutation(
+        "a lost service stays green on the screen",
+        f"{HMI}/core/words.py",
+        "if seen.is_alive is False or age_s > STATE_LOST_S:",
+        "if False:",
+        ("tests/unit/hmi/test_words.py",),
+    ),
+    Mutation(
+        "operators may export production records",
+        f"{HMI}/core/rights.py",
+        "Item.PRODUCT_VIEW: (_V, _V, _V, _F)",
+        "Item.PRODUCT_VIEW: (_V, _F, _V, _F)",
+        ("tests/unit/hmi/test_rights.py",),
+    ),
+    Mutation(
+        "an unknown name is told from a wrong password by its time",
+        f"{HMI}/drivers/hashing.py",
+        "self._argon2.verify(known or self._nobody, password) and known is not None",
+        "known is not None and self._argon2.verify(known, password)",
+        ("tests/unit/hmi/test_gate.py",),
+    ),
+    Mutation(
+        "wrong passwords make nobody wait",
+        f"{HMI}/core/passwords.py",
+        "if failures <= FREE_TRIES or",
+        "if True or",
+        ("tests/unit/hmi",),
+    ),
+    Mutation(
+        "polling keeps a forgotten session open",
+        f"{HMI}/drivers/accounts.py",
+        "if is_active and now_s - active_s > ACTIVITY_S:",
+        "if now_s - active_s > ACTIVITY_S:",
+        ("tests/unit/hmi/test_accounts.py",),
+    ),
+    Mutation(
+        "a login keeps the session that was there before",
+        f"{HMI}/pages/gate.py",
+        "        if isinstance(visitor, Visitor) and visitor.session:\n"
+        "            accounts.close_session(visitor.session)\n",
+        "",
+        ("tests/unit/hmi/test_gate.py",),
+    ),
+    Mutation(
+        "another site may post for somebody",
+        f"{HMI}/pages/shield.py",
+        'return None if is_own_origin(origin, host) else "the request comes from another site"',
+        "return None",
+        ("tests/unit/hmi/test_shield.py",),
+    ),
+    Mutation(
+        "a session that ended goes on as a viewer",
+        f"{HMI}/pages/gate.py",
+        "return None if found is None or found.session != visitor.session else found",
+        "return found",
+        ("tests/unit/hmi/test_gate.py",),
+    ),
+    Mutation(
+        "a part id becomes a formula in a spreadsheet",
+        f"{HMI}/core/table.py",
+        "if text.lstrip()[:1] in",
+        "if False and text.lstrip()[:1] in",
+        ("tests/unit/hmi/test_events_tables.py",),
     ),
 )
 

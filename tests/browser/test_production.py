@@ -32,7 +32,7 @@ def test_products_are_searched_on_the_server_and_one_click_shows_why(visit: Call
     expect(products).to_have_count(1)
     asked = [q for q in feed.asked if isinstance(q, m.AskRecords)][-1]
     assert (asked.search, asked.with_trends) == ("a4051", False)
-    page.get_by_role("button", name="A4051").focus()
+    page.get_by_role("button", name="51", exact=True).focus()
     page.keyboard.press("Enter")
     detail = page.locator(".detail")
     expect(detail.locator(".sign.big .word")).to_have_text("FAILED")

@@ -68,6 +68,16 @@ def test_the_header_is_green_only_for_what_fieldbus_says_now(
         assert {words.ready, words.plc, words.mode} == {w.UNKNOWN}
 
 
+def test_ready_is_off_during_a_cycle_and_that_is_no_fault() -> None:
+    def ready(**values: str | bool) -> w.Sign:
+        return w.header_words(s.with_service(CellState("c"), fieldbus(ready=False, **values), 1.0), 1.0).ready
+
+    assert ready(handshake="measuring").word == "measuring"
+    assert ready(handshake="idle", not_ready_because="the disk is full") == w.Sign(
+        "amber", "warn", "not ready", "the disk is full"
+    )
+
+
 @given(decision=st.sampled_from(list(m.Decision)), age_s=st.floats(0, 1e4))
 def test_the_last_verdict_is_green_only_when_passed_and_fresh(decision: m.Decision, age_s: float) -> None:
     code = {"PASSED": 1, "FAILED": 2, "UNSURE": 3}.get(decision.value, 12)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 CHINESE: dict[str, str] = {
     "80 % of the forecasts": "80% 的预测范围",
+    "A limit is exceeded for certain. The PLC gets Failed.": "确定超出极限。PLC 得到 Failed。",
     "A name has 1 to 40 printable characters.": "名称须为 1 至 40 个可打印字符。",
     "A password has 12 characters at least; several words make a good one.": "密码至少 12 个字符；由多个词组成为佳。",
     "A password has 256 characters at most.": "密码最多 256 个字符。",
@@ -35,10 +36,12 @@ CHINESE: dict[str, str] = {
     "calibrate": "进行标定",
     "Calibration": "标定",
     "Camera": "相机",
+    "Camera control": "相机控制",
     "camera fault": "相机故障",
     "Camera picture": "相机图像",
     "camera silent": "相机无消息",
     "camera stopped by the PLC during the cycle": "周期中相机被 PLC 停止",
+    "Camera view": "相机画面",
     "Cancel": "取消",
     "capture delivered no frame": "capture 未提供图像",
     "Cell": "单元",
@@ -48,6 +51,7 @@ CHINESE: dict[str, str] = {
     "Change the password": "修改密码",
     "Change the role": "更改角色",
     "Close": "关闭",
+    "Code": "代码",
     "Code from the log": "日志中的代码",
     "coil_change": "换卷",
     "colour map": "色图",
@@ -71,11 +75,17 @@ CHINESE: dict[str, str] = {
     "Direction": "方向",
     "Done.": "完成。",
     "DOWN": "断开",
+    "Drag turns a part, the wheel zooms, the right button moves; with the keyboard arrow keys, plus, minus and Home.": (
+        "拖动旋转零件，滚轮缩放，右键平移；键盘使用方向键、加减键和 Home 键。"
+    ),
     "Drawing": "显示方式",
     "Encrypted (TLS)": "加密 (TLS)",
     "error": "误差",
     "errors": "错误",
     "Events": "事件",
+    "Every value stands with its age. A service that is silent for six seconds is lost.": (
+        "每个数值都标明时间。服务六秒无消息即视为失联。"
+    ),
     "Export as CSV": "导出 CSV",
     "export production records": "导出生产记录",
     "export the log": "导出日志",
@@ -100,9 +110,11 @@ CHINESE: dict[str, str] = {
     "from the last 3 parts": "用最近 3 个零件",
     "from the last 5 parts": "用最近 5 个零件",
     "from the next parts": "用后续零件",
+    "Full access": "完全访问",
     "Gain [dB]": "增益 [dB]",
     "Give a new password": "设置新密码",
     "gone": "已离开",
+    "Good to know": "使用须知",
     "Handshake": "握手",
     "Heard": "最近消息",
     "height difference": "高度差",
@@ -115,10 +127,14 @@ CHINESE: dict[str, str] = {
     ),
     "In automatic mode the PLC measures.": "自动模式下由 PLC 触发测量。",
     "In manual mode the PLC gets no results. Change the mode?": "手动模式下 PLC 得不到结果。是否切换模式？",
+    "In the log and in production everything is searched on the server, also what is not shown.": (
+        "日志和生产画面在服务器上搜索全部数据，包括未显示的数据。"
+    ),
     "info": "信息",
     "Inputs and outputs": "输入与输出",
     "insert": "更换镶块",
     "inside the guard band": "处于保护带内",
+    "Item": "项目",
     "just now": "刚刚",
     "Kind": "类型",
     "Largest error": "最大误差",
@@ -178,6 +194,7 @@ CHINESE: dict[str, str] = {
     "measure by hand": "手动测量",
     "measured": "实测",
     "Measurement": "测量",
+    "measuring": "正在测量",
     "mesh": "网格",
     "Mode": "模式",
     "must change the password": "须修改密码",
@@ -187,6 +204,8 @@ CHINESE: dict[str, str] = {
     "New password, 12 characters at least": "新密码（至少 12 个字符）",
     "Newer": "较新",
     "no": "否",
+    "No access": "无权限",
+    "No access to others": "不能访问他人",
     "No alarm": "没有报警",
     "No event is found": "没有找到事件",
     "no forecast yet": "暂无预测",
@@ -229,6 +248,7 @@ CHINESE: dict[str, str] = {
     "part failed": "零件不合格",
     "Part in three dimensions": "零件三维图",
     "part lies outside the allowed pose": "零件位置超出允许范围",
+    "Part of parameters": "部分参数",
     "Part or stroke": "零件或冲程",
     "part passed": "零件合格",
     "Part {part}, stroke {stroke}": "零件 {part}，冲程 {stroke}",
@@ -241,6 +261,7 @@ CHINESE: dict[str, str] = {
     "PLC": "PLC",
     "polish": "抛光",
     "Position dx, dy, dz": "位置 dx, dy, dz",
+    "Product view": "产品画面",
     "Production": "生产",
     "Products": "产品",
     "Profile": "协议配置",
@@ -252,6 +273,8 @@ CHINESE: dict[str, str] = {
     "recipe changed during the cycle": "周期中配方被更改",
     "Records and trend: {age}": "记录与趋势：{age}",
     "regrind": "修磨",
+    "Result codes": "结果代码",
+    "Rights": "权限",
     "Role": "角色",
     "Room for the journal": "日志空间",
     "Ruler": "标尺",
@@ -294,11 +317,17 @@ CHINESE: dict[str, str] = {
     "The new template is what all parts of object {n} are compared with. Make it?": (
         "对象 {n} 的所有零件将与新模板比较。是否生成？"
     ),
+    "The part could not be measured; the code says why. The PLC gets Failed.": (
+        "零件无法测量；代码说明原因。PLC 得到 Failed。"
+    ),
     "The password until now is wrong.": "当前密码错误。",
     "THE PLC WAS NOT TOLD.": "PLC 未被告知。",
     "The recipe names no zones": "配方中没有区域",
     "The trend of object {n} begins anew with this service. Log it?": (
         "对象 {n} 的趋势将从此次维护重新开始。是否登记？"
+    ),
+    "The whole part was measured and lies within its limits. The PLC gets Passed.": (
+        "零件已完整测量且在极限之内。PLC 得到 Passed。"
     ),
     "There is an administrator already.": "已有管理员。",
     "There is no such user.": "没有该用户。",
@@ -323,16 +352,22 @@ CHINESE: dict[str, str] = {
     "too little of the part was seen": "可见零件部分过少",
     "Too many log in at once. Try again in a moment.": "同时登录人数过多，请稍后再试。",
     "Too many wrong ones. Try again in {n} s.": "错误次数过多，请在 {n} 秒后重试。",
+    "Too near to a limit to be certain. The PLC gets Failed unless the recipe says other.": (
+        "数值过于接近极限，无法确定。除非配方另有规定，PLC 得到 Failed。"
+    ),
     "Type": "数据类型",
     "Uncertainty [mm]": "不确定度 [mm]",
     "unknown": "未知",
     "UNSURE": "不确定",
     "up": "已连接",
     "User": "用户",
+    "User control": "用户管理",
     "User or deed": "用户或操作",
     "Users": "用户",
     "Value": "值",
     "Verdict": "判定",
+    "Verdicts": "判定结果",
+    "View only": "只能查看",
     "viewer": "查看者",
     "Volume [mm³]": "体积 [mm³]",
     "warning": "警告",
@@ -345,6 +380,9 @@ CHINESE: dict[str, str] = {
     "Wear [mm]": "磨损 [mm]",
     "Wear trend": "磨损趋势",
     "wear {mm} mm": "磨损 {mm} mm",
+    "What is old or unknown is grey, dashed or marked OLD, never green.": (
+        "过期或未知的内容显示为灰色、虚线或标有“已过期”，绝不显示为绿色。"
+    ),
     "What was done": "维护内容",
     "When": "何时",
     "Where parts deviate, and how often": "零件偏差位置与频率",

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 GERMAN: dict[str, str] = {
     "80 % of the forecasts": "80 % der Vorhersagen",
+    "A limit is exceeded for certain. The PLC gets Failed.": (
+        "Eine Grenze ist sicher überschritten. Die SPS bekommt Failed."
+    ),
     "A name has 1 to 40 printable characters.": "Ein Name hat 1 bis 40 druckbare Zeichen.",
     "A password has 12 characters at least; several words make a good one.": (
         "Ein Passwort hat mindestens 12 Zeichen; mehrere Wörter ergeben ein gutes."
@@ -41,10 +44,12 @@ GERMAN: dict[str, str] = {
     "calibrate": "kalibrieren",
     "Calibration": "Kalibrierung",
     "Camera": "Kamera",
+    "Camera control": "Kamerasteuerung",
     "camera fault": "Kamerafehler",
     "Camera picture": "Kamerabild",
     "camera silent": "Kamera schweigt",
     "camera stopped by the PLC during the cycle": "Kamera während des Zyklus von der SPS angehalten",
+    "Camera view": "Kamerabild ansehen",
     "Cancel": "Abbrechen",
     "capture delivered no frame": "capture hat kein Bild geliefert",
     "Cell": "Zelle",
@@ -54,6 +59,7 @@ GERMAN: dict[str, str] = {
     "Change the password": "Passwort ändern",
     "Change the role": "Rolle ändern",
     "Close": "Schließen",
+    "Code": "Code",
     "Code from the log": "Code aus dem Protokoll",
     "coil_change": "Coilwechsel",
     "colour map": "Farbkarte",
@@ -77,11 +83,17 @@ GERMAN: dict[str, str] = {
     "Direction": "Richtung",
     "Done.": "Erledigt.",
     "DOWN": "GETRENNT",
+    "Drag turns a part, the wheel zooms, the right button moves; with the keyboard arrow keys, plus, minus and Home.": (
+        "Ziehen dreht, das Rad zoomt, die rechte Taste verschiebt; auf der Tastatur Pfeile, Plus, Minus und Pos1."
+    ),
     "Drawing": "Darstellung",
     "Encrypted (TLS)": "Verschlüsselt (TLS)",
     "error": "Fehler",
     "errors": "Fehler",
     "Events": "Ereignisse",
+    "Every value stands with its age. A service that is silent for six seconds is lost.": (
+        "Jeder Wert steht mit seinem Alter da. Ein Dienst, der sechs Sekunden schweigt, ist verloren."
+    ),
     "Export as CSV": "Als CSV ausgeben",
     "export production records": "Produktion ausgeben",
     "export the log": "Protokoll ausgeben",
@@ -108,9 +120,11 @@ GERMAN: dict[str, str] = {
     "from the last 3 parts": "aus den letzten 3 Teilen",
     "from the last 5 parts": "aus den letzten 5 Teilen",
     "from the next parts": "aus den nächsten Teilen",
+    "Full access": "Voller Zugriff",
     "Gain [dB]": "Verstärkung [dB]",
     "Give a new password": "Neues Passwort vergeben",
     "gone": "gegangen",
+    "Good to know": "Gut zu wissen",
     "Handshake": "Handshake",
     "Heard": "Gehört",
     "height difference": "Höhenunterschied",
@@ -125,10 +139,14 @@ GERMAN: dict[str, str] = {
     "In manual mode the PLC gets no results. Change the mode?": (
         "Im Handbetrieb bekommt die SPS keine Ergebnisse. Betriebsart wechseln?"
     ),
+    "In the log and in production everything is searched on the server, also what is not shown.": (
+        "Im Protokoll und in der Produktion wird alles auf dem Server durchsucht, auch was nicht gezeigt wird."
+    ),
     "info": "Hinweis",
     "Inputs and outputs": "Ein- und Ausgänge",
     "insert": "Einsatz gewechselt",
     "inside the guard band": "im Unsicherheitsband",
+    "Item": "Gegenstand",
     "just now": "gerade eben",
     "Kind": "Art",
     "Largest error": "Größter Fehler",
@@ -188,6 +206,7 @@ GERMAN: dict[str, str] = {
     "measure by hand": "von Hand messen",
     "measured": "Ist",
     "Measurement": "Messung",
+    "measuring": "misst",
     "mesh": "Gitter",
     "Mode": "Betriebsart",
     "must change the password": "muss das Passwort ändern",
@@ -197,6 +216,8 @@ GERMAN: dict[str, str] = {
     "New password, 12 characters at least": "Neues Passwort, mindestens 12 Zeichen",
     "Newer": "Neuere",
     "no": "nein",
+    "No access": "Kein Zugriff",
+    "No access to others": "Kein Zugriff auf andere",
     "No alarm": "Kein Alarm",
     "No event is found": "Kein Ereignis gefunden",
     "no forecast yet": "noch keine Vorhersage",
@@ -239,6 +260,7 @@ GERMAN: dict[str, str] = {
     "part failed": "Teil ist schlecht",
     "Part in three dimensions": "Teil dreidimensional",
     "part lies outside the allowed pose": "Teil liegt außerhalb der erlaubten Lage",
+    "Part of parameters": "Teil der Parameter",
     "Part or stroke": "Teil oder Hub",
     "part passed": "Teil ist gut",
     "Part {part}, stroke {stroke}": "Teil {part}, Hub {stroke}",
@@ -251,6 +273,7 @@ GERMAN: dict[str, str] = {
     "PLC": "SPS",
     "polish": "poliert",
     "Position dx, dy, dz": "Lage dx, dy, dz",
+    "Product view": "Produktansicht",
     "Production": "Produktion",
     "Products": "Produkte",
     "Profile": "Profil",
@@ -262,6 +285,8 @@ GERMAN: dict[str, str] = {
     "recipe changed during the cycle": "Rezept während des Zyklus geändert",
     "Records and trend: {age}": "Aufzeichnungen und Verlauf: {age}",
     "regrind": "nachgeschliffen",
+    "Result codes": "Ergebniscodes",
+    "Rights": "Rechte",
     "Role": "Rolle",
     "Room for the journal": "Platz für das Journal",
     "Ruler": "Lineal",
@@ -306,11 +331,17 @@ GERMAN: dict[str, str] = {
     "The new template is what all parts of object {n} are compared with. Make it?": (
         "Mit der neuen Vorlage werden alle Teile des Objekts {n} verglichen. Erstellen?"
     ),
+    "The part could not be measured; the code says why. The PLC gets Failed.": (
+        "Das Teil konnte nicht gemessen werden; der Code sagt, warum. Die SPS bekommt Failed."
+    ),
     "The password until now is wrong.": "Das bisherige Passwort ist falsch.",
     "THE PLC WAS NOT TOLD.": "DIE SPS BEKAM KEINE MELDUNG.",
     "The recipe names no zones": "Das Rezept nennt keine Zonen",
     "The trend of object {n} begins anew with this service. Log it?": (
         "Der Verlauf des Objekts {n} beginnt mit dieser Wartung neu. Eintragen?"
+    ),
+    "The whole part was measured and lies within its limits. The PLC gets Passed.": (
+        "Das ganze Teil wurde gemessen und hält seine Grenzen ein. Die SPS bekommt Passed."
     ),
     "There is an administrator already.": "Es gibt schon einen Administrator.",
     "There is no such user.": "Diesen Benutzer gibt es nicht.",
@@ -339,16 +370,22 @@ GERMAN: dict[str, str] = {
         "Zu viele melden sich gleichzeitig an. Versuchen Sie es gleich noch einmal."
     ),
     "Too many wrong ones. Try again in {n} s.": "Zu viele falsche. Versuchen Sie es in {n} s noch einmal.",
+    "Too near to a limit to be certain. The PLC gets Failed unless the recipe says other.": (
+        "Zu nah an einer Grenze, um sicher zu sein. Die SPS bekommt Failed, wenn das Rezept nichts anderes sagt."
+    ),
     "Type": "Typ",
     "Uncertainty [mm]": "Unsicherheit [mm]",
     "unknown": "unbekannt",
     "UNSURE": "UNSICHER",
     "up": "verbunden",
     "User": "Benutzer",
+    "User control": "Benutzerverwaltung",
     "User or deed": "Benutzer oder Tätigkeit",
     "Users": "Benutzer",
     "Value": "Wert",
     "Verdict": "Urteil",
+    "Verdicts": "Urteile",
+    "View only": "Nur ansehen",
     "viewer": "Betrachter",
     "Volume [mm³]": "Volumen [mm³]",
     "warning": "Warnung",
@@ -361,6 +398,9 @@ GERMAN: dict[str, str] = {
     "Wear [mm]": "Verschleiß [mm]",
     "Wear trend": "Verschleißverlauf",
     "wear {mm} mm": "Verschleiß {mm} mm",
+    "What is old or unknown is grey, dashed or marked OLD, never green.": (
+        "Was alt oder unbekannt ist, ist grau, gestrichelt oder mit ALT bezeichnet, nie grün."
+    ),
     "What was done": "Was getan wurde",
     "When": "Wann",
     "Where parts deviate, and how often": "Wo Teile abweichen, und wie oft",

@@ -172,8 +172,15 @@ def header_words(state: CellState, now_s: float) -> HeaderWords:
         "auto": Sign("green", "check", "auto"),
         "manual": Sign("amber", "hand", "manual"),
     }.get(mode, UNKNOWN)
+    # During a cycle Ready is off by the rules of the handshake, and all is well.
+    is_busy = told.values.get("handshake") in ("measuring", "telling", "told")
+    not_ready = Sign("amber", "warn", "not ready", str(told.values.get("not_ready_because") or ""))
     return HeaderWords(
-        _flag(told.values.get("ready"), Sign("green", "check", "Ready"), Sign("amber", "clock", "not ready")),
+        _flag(
+            told.values.get("ready"),
+            Sign("green", "check", "Ready"),
+            Sign("green", "clock", "measuring") if is_busy else not_ready,
+        ),
         mode_sign,
         _flag(told.values.get("plc_link_up"), Sign("green", "check", "up"), Sign("red", "cross", "DOWN")),
         object_text,

@@ -61,6 +61,9 @@ class SignElement(Element):
             self.classes(replace=f"{' '.join(c for c in self._classes if c not in COLOURS)} {sign.colour}")
             self._shape.classes(replace=f"shape {sign.icon}")
             self._word.set_text(self._say(sign.word))
+        if self._props.get("title", "") != sign.detail:
+            self._props["title"] = sign.detail
+            self.update()
 
 
 COLOURS = ("green", "red", "amber", "grey")

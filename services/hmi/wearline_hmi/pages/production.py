@@ -135,7 +135,7 @@ def _products(page: Frame) -> None:
                 link.props["download"] = "production.csv"
         rows = Rows(
             [
-                Column("part", say("Part")), Column("stroke", say("Stroke"), True), Column("time", say("Time (UTC)")),
+                Column("stroke", say("Stroke"), True), Column("part", say("Part")), Column("time", say("Time (UTC)")),
                 Column("object", say("Object"), True), Column("verdict", say("Verdict")),
                 Column("mean", say("Mean [mm]"), True), Column("max", say("Max [mm]"), True),
                 Column("told", say("Told"), True), Column("cycle", say("Cycle [ms]"), True),

@@ -21,6 +21,7 @@ from wearline_hmi.pages.api import make_api
 from wearline_hmi.pages.camera import build_camera
 from wearline_hmi.pages.frame import Site
 from wearline_hmi.pages.gate import Doorkeeper, Gate, add_gate
+from wearline_hmi.pages.help import build_help
 from wearline_hmi.pages.live import add_live
 from wearline_hmi.pages.log import add_log_export, build_log
 from wearline_hmi.pages.measurement import build_measurement
@@ -140,6 +141,7 @@ def make_app(service: HmiService, keeper: Doorkeeper) -> FastAPI:
     site.add("/log", "Log", rights.LOOK_AT_LOG, build_log)
     site.add("/settings", "Settings", rights.LOOK_AT_SETTINGS, build_settings)
     site.add("/users", "Users", rights.LOOK_AT_USERS, build_users)
+    site.add("/help", "Help", rights.READ_HELP, build_help)
     add_export(app, site)
     add_log_export(app, site)
     app.mount("/api", make_api(site))
