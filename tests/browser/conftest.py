@@ -104,14 +104,14 @@ def start_hmi(path: Path) -> Hmi:
     return Hmi(process, url, log)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def cell_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = write_cell(tmp_path_factory.mktemp("cell"))
     add_users(path)
     return path
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def accounts(cell_path: Path) -> Iterator[Accounts]:
     """The users of the running hmi, reached past it."""
     found = accounts_of(cell_path)
@@ -119,7 +119,7 @@ def accounts(cell_path: Path) -> Iterator[Accounts]:
     found.close()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def feed(cell_path: Path) -> Iterator[Feed]:
     """Forty strokes of a wearing die are recorded."""
     feed = Feed(load_cell(cell_path))
@@ -129,7 +129,7 @@ def feed(cell_path: Path) -> Iterator[Feed]:
     feed.close()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def hmi(cell_path: Path, feed: Feed) -> Iterator[Hmi]:
     running = start_hmi(cell_path)
     # What it hears in its first moments may be history of unknown age, and is shown as such.
@@ -139,7 +139,7 @@ def hmi(cell_path: Path, feed: Feed) -> Iterator[Hmi]:
     running.stop()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def browser() -> Iterator[Browser]:
     """Chromium, or a skip where there is none."""
     if not CHROMIUM.exists():

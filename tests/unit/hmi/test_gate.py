@@ -202,7 +202,7 @@ def test_the_first_administrator_needs_the_code_of_the_log(house: House, caplog:
     browser = house.browser()
     assert browser.get("/login").headers["location"] == "/setup"
     house.keeper.announce("http://127.0.0.1:8080")
-    code = re.search(r"code ([A-Z2-9]{4}-[A-Z2-9]{4}-[A-Z2-9]{4})$", caplog.messages[0])
+    code = re.search(r"code ([A-Z2-9]{4}-[A-Z2-9]{4}-[A-Z2-9]{4})$", caplog.text, re.M)
     assert code is not None
     fields = {"name": "Ada", "password": PASSWORD}
     assert browser.post("/setup", data={**fields, "code": "AAAA-AAAA-AAAA"}).status_code == 401
