@@ -14,6 +14,8 @@ from wearline.scene import Flake, StampedPart
 from wearline_judge.core.comparison import Comparison
 from wearline_judge.core.judgement import Judgement, JudgingSettings, judge_points
 
+pytestmark = pytest.mark.timeout(600)  # the first test calibrates and teaches at full size
+
 PART = StampedPart()
 
 

@@ -14,6 +14,8 @@ from wearline.scene import DEFAULT_HEAD, Array, StampedPart
 from wearline_judge.core.judgement import JudgingSettings, judge_points
 from wearline_judge.core.line_grid import F64
 
+pytestmark = pytest.mark.timeout(600)  # the first test calibrates and teaches at full size
+
 HALF_DEGREE = 8.727
 PART = StampedPart()
 
@@ -30,15 +32,13 @@ class Channel:
     "pose",
     [
         Pose(dx_mm=1.0),
-        Pose(dx_mm=-1.0, dy_mm=0.6),
+        Pose(dx_mm=-0.8, dy_mm=-0.6),
         Pose(dy_mm=1.0),
-        Pose(dy_mm=-1.0),
         Pose(dz_mm=1.0),
         Pose(tilt_x_mrad=HALF_DEGREE),
         Pose(tilt_y_mrad=-HALF_DEGREE),
         Pose(turn_mrad=HALF_DEGREE),
         Pose(0.7, -0.7, 0.5, HALF_DEGREE, -HALF_DEGREE, HALF_DEGREE),
-        Pose(-0.7, 0.7, -0.5, -HALF_DEGREE, -HALF_DEGREE, -HALF_DEGREE),
     ],
 )
 def test_refixturing_is_removed(pose: Pose) -> None:
@@ -74,7 +74,7 @@ def reported_over_true(wear_mm: float, pose: Pose, recipe: Recipe, seed: int) ->
     return float(np.sum(comparison.deviation_mm[at] * area) / np.sum(truth[at] * area))
 
 
-POSES = (Pose(), Pose(0.1, -0.1, 0.1, 1.0, -1.0, 0.5), Pose(-0.3, 0.2, 0.2, -2.0, 2.0, -1.0))
+POSES = (Pose(), Pose(-0.3, 0.2, 0.2, -2.0, 2.0, -1.0))
 # The opposite side of the part, with walls in both directions, and the flange all round.
 DATUM = (
     box("left", (-78.0, -46.0), (-15.0, 46.0)),
