@@ -46,6 +46,8 @@ def write_cell(folder: Path, base_port: int, strokes: int | None, stroke_period_
         "router": {"endpoint": f"tcp/127.0.0.1:{base_port}"},
         "metrics_ports": {name: base_port + 1 + index for index, name in enumerate(SERVICES)},
         "capture": {"kind": "sim"},
+        # This die lasts 65 strokes: the alarm's ladder must not stand on a real die's thousands.
+        "judge": {"alarms": {"strokes_to_stop": 10}},
         "fieldbus": {"plc": {"host": "127.0.0.1", "port": base_port + 6}},
         "hmi": {"port": base_port + 8, "view_without_login": True},
         "plc_sim": {

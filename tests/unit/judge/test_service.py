@@ -56,6 +56,7 @@ from wearline_judge.drivers.frames import pixel_hash
 from wearline_judge.drivers.records import Cycle, RecordStore
 from wearline_judge.drivers.references import StoredReferences
 from wearline_judge.service import Judge, Stores, open_stores
+from wearline_judge.service.trends import ALARM
 
 TEMPLATE_BYTES = golden_template().to_bytes()
 START = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
@@ -624,6 +625,28 @@ def test_the_next_parts_teach_an_object_that_has_no_template(make: Callable[...,
     (event,) = events
     assert "version 3" in event.text
     assert cell.judged(Part(), 4).decision is Decision.PASSED
+
+
+def test_a_frame_of_which_nothing_more_is_heard_does_not_keep_the_journal_waiting(cell: Cell) -> None:
+    asked = request(5)
+    frame = Frame(
+        cycle_id=asked.cycle_id, is_simulated=False, request=asked, camera="c", pixels=np.zeros((4, 4), np.uint8),
+        exposure_us=1e4, frame_counter=5,
+    )  # fmt: skip
+    cell.judge.on_frame(frame)
+    list(cell.judge.tick(cell.clock() + 3.0))
+    assert cell.fieldbus.asked == []
+    list(cell.judge.tick(cell.clock() + 6.0))
+    assert len(cell.fieldbus.asked) == 1
+
+
+def test_trends_and_alarms_are_told_again_after_a_restart(cell: Cell) -> None:
+    cell.judged(Part(), 7)
+    list(cell.judge.on_outcome(outcome(7)))
+    cell.restart()
+    ALARM.clear()
+    list(cell.judge.tick(200.0))
+    assert 'wearline_alarm_level{cell="test",object="1",zone="part"} 0.0' in generate_latest(REGISTRY).decode()
 
 
 def test_frames_are_stored_under_their_hash_after_the_verdict(make: Callable[..., Cell]) -> None:

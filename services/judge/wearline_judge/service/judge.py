@@ -71,6 +71,8 @@ _KEPT_SETUPS = 8
 _KEPT_CYCLES = 1024
 _FRAMES_WAITING = 4
 """Frames whose verdict has not come yet; 2 MB each."""
+_FRAME_WAITS_S = 5.0
+"""No cycle lasts so long: what was to become of this frame is lost. [s]"""
 _POINTS_KEPT = 24
 """Measured cycles that a template can be taught from; 0.8 MB each."""
 
@@ -100,7 +102,7 @@ class Judge(Service):
         self._asker: Asker | None = None
         self._setups: OrderedDict[tuple[str, str], Setup] = OrderedDict()
         self._judged: OrderedDict[str, None] = OrderedDict()
-        self._frames: OrderedDict[str, Frame] = OrderedDict()
+        self._frames: OrderedDict[str, tuple[float, Frame]] = OrderedDict()
         self._points: OrderedDict[str, LinePoints] = OrderedDict()
         self._teaching: dict[int, list[str]] = {}
         self._last_ms = 0.0
@@ -122,6 +124,9 @@ class Judge(Service):
                 self._setup(self._references.object_recipe(entry.object_index))
             except (WearlineError, _RefusedError) as error:
                 yield self._event("warning", f"object {entry.object_index}: {error}")
+        if self._trends is not None:
+            for index in self._stores.records.objects():
+                self._trends.recorded(index)
 
     def handlers(self) -> Mapping[Topic, Callable[[Any], Iterable[Message]]]:
         return {FRAME: self.on_frame, LINE_POINTS: self.on_line_points, OUTCOME: self.on_outcome}
@@ -149,6 +154,9 @@ class Judge(Service):
             return
         if self._recording.unrecorded and (count := self._recording.catch_up()):
             yield self._event("info", f"{count} entries that could not be recorded before are on record now")
+        for cycle_id, (since_s, _) in tuple(self._frames.items()):
+            if now_s - since_s > _FRAME_WAITS_S:
+                self._drop_frame(cycle_id)
         if self._frames:
             return
         if self._asker is not None and self._recording.is_due(now_s):
@@ -192,10 +200,9 @@ class Judge(Service):
     def on_frame(self, frame: Frame) -> Iterable[Message]:
         """Hold the frame until its verdict says how long it is worth keeping."""
         if self._stores is not None and frame.pixels.size:
-            self._frames[frame.cycle_id] = frame
+            self._frames[frame.cycle_id] = (self._clock(), frame)
             while len(self._frames) > _FRAMES_WAITING:
-                _, old = self._frames.popitem(last=False)
-                self._stores.frames.put(old.pixels, Class.NOT_MEASURED)
+                self._drop_frame(next(iter(self._frames)))
         return ()
 
     def on_line_points(self, points: LinePoints) -> Iterator[Message]:
@@ -363,15 +370,14 @@ class Judge(Service):
             self._judged.popitem(last=False)
 
     def _keep_frame(self, verdict: Verdict) -> None:
-        frame = self._frames.pop(verdict.cycle_id, None)
-        if frame is not None and self._stores is not None:
-            kinds = {Decision.PASSED: Class.PASSED, Decision.NOT_MEASURED: Class.NOT_MEASURED}
-            self._stores.frames.put(frame.pixels, kinds.get(verdict.decision, Class.FAILED))
+        kinds = {Decision.PASSED: Class.PASSED, Decision.NOT_MEASURED: Class.NOT_MEASURED}
+        self._drop_frame(verdict.cycle_id, kinds.get(verdict.decision, Class.FAILED))
 
-    def _drop_frame(self, cycle_id: str) -> None:
-        frame = self._frames.pop(cycle_id, None)
+    def _drop_frame(self, cycle_id: str, kind: Class = Class.NOT_MEASURED) -> None:
+        """Hand a frame that waited to the store."""
+        _, frame = self._frames.pop(cycle_id, (0.0, None))
         if frame is not None and self._stores is not None:
-            self._stores.frames.put(frame.pixels, Class.NOT_MEASURED)
+            self._stores.frames.put(frame.pixels, kind)
 
     # --- answers ---
 
