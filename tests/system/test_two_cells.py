@@ -10,15 +10,15 @@ import pytest
 from tests.system.cell import SimulatedCell, cycle_seconds
 from wearline.messages import Outcome
 
-STROKES = 6
+STROKES = 5
 
 
 def test_a_cell_that_dies_does_not_touch_its_neighbour(
     tmp_path: Path, taught: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with (
-        SimulatedCell(tmp_path / "left", taught, name="left", stroke_period_s=1.5) as left,
-        SimulatedCell(tmp_path / "right", taught, name="right", stroke_period_s=1.5) as right,
+        SimulatedCell(tmp_path / "left", taught, name="left", stroke_period_s=1.2) as left,
+        SimulatedCell(tmp_path / "right", taught, name="right", stroke_period_s=1.2) as right,
     ):
         left.wait_until_measured(0.0, within_s=40.0)
         start_s = right.wait_until_measured(0.0, within_s=40.0)
