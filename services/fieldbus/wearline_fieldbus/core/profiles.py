@@ -10,6 +10,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import cached_property
 from typing import Any
 
 from wearline.errors import ConfigError
@@ -88,7 +89,7 @@ class Profile:
 
     def of(self, direction: Direction) -> tuple[Field, ...]:
         """The fields of one direction, in the order of the table."""
-        return tuple(f for f in self.fields if f.direction is direction)
+        return self._of[direction]
 
     def field(self, name: str) -> Field | None:
         """The field of that name, or None where a remap left it out."""
@@ -96,10 +97,21 @@ class Profile:
 
     def span(self, direction: Direction) -> tuple[int, int]:
         """First byte and the byte after the last one of one direction."""
-        fields = self.of(direction)
-        return min(f.byte for f in fields), max(f.byte + f.size for f in fields)
+        return self._spans[direction]
 
-    @property
+    # Asked at every poll, and a table never changes.
+    @cached_property
+    def _of(self) -> dict[Direction, tuple[Field, ...]]:
+        return {d: tuple(f for f in self.fields if f.direction is d) for d in Direction}
+
+    @cached_property
+    def _spans(self) -> dict[Direction, tuple[int, int]]:
+        return {
+            d: (min(f.byte for f in fields), max(f.byte + f.size for f in fields))
+            for d, fields in self._of.items() if fields
+        }  # fmt: skip
+
+    @cached_property
     def size(self) -> int:
         """Bytes of the whole image, from byte 0."""
         return max(f.byte + f.size for f in self.fields)
