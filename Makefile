@@ -67,6 +67,18 @@ plc-faults: .venv/ready-dev ## Every network fault at every step of a PLC cycle,
 	@.venv/bin/python -m pytest -m slow -s tests/faults/test_plc_faults.py $(T)
 	@WEARLINE_FAULT_EXAMPLES=3000 .venv/bin/python -m pytest tests/unit/fieldbus/test_handshake_machine.py --timeout 1800
 
+proof: .venv/ready-dev ## Search the model of the PLC handshake exhaustively, small and large size (needs spin, gcc); T=--stories
+	@.venv/bin/python -m tests.proof.run $(T)
+
+handshake-mutations: .venv/ready-dev ## Leave out every guard of the handshake in turn and see who objects (long; needs spin, gcc)
+	@.venv/bin/python -m tests.proof.mutations $(T)
+
+handshake-walk: .venv/ready-dev ## 10^5 random triggers of the real handshake against the reference PLC
+	@WEARLINE_WALK_TRIGGERS=100000 .venv/bin/python -m pytest tests/proof/test_walk.py $(T)
+
+handshake-soak: .venv/ready-dev ## 10^6 of them
+	@WEARLINE_WALK_TRIGGERS=1000000 .venv/bin/python -m pytest tests/proof/test_walk.py $(T)
+
 images: ## Container images of all services (needs Docker with BuildKit)
 	@deploy/images.sh
 
@@ -76,4 +88,4 @@ constraints: .venv/ready-dev ## Pin all third-party packages anew
 clean: ## Forget the environment and the demo's data
 	rm -rf .venv run build
 
-.PHONY: help demo test lint format bench browser kills records-million kill-writers mutations images constraints clean plc-faults
+.PHONY: help demo test lint format bench browser kills records-million kill-writers mutations images constraints clean plc-faults proof handshake-mutations handshake-walk handshake-soak
