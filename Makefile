@@ -45,6 +45,9 @@ wear-forecast: .venv/ready-dev ## Forecasts on 1000 simulated dies beside a stra
 browser: .venv/ready-dev ## The screens in Chromium, the long forms too
 	@.venv/bin/python -m pytest -m "slow or not slow" tests/browser $(T)
 
+fuzz: .venv/ready-dev ## 10 000 mutated frames through the measuring chain (long)
+	@.venv/bin/python -m pytest -m slow tests/metrology/test_mutations.py $(T)
+
 kills: .venv/ready-dev ## 20 kill -9 and 7 hung services while strokes run (long)
 	@.venv/bin/python -m pytest -m slow tests/faults $(T)
 
@@ -88,4 +91,4 @@ constraints: .venv/ready-dev ## Pin all third-party packages anew
 clean: ## Forget the environment and the demo's data
 	rm -rf .venv run build
 
-.PHONY: help demo test lint format bench browser kills records-million kill-writers mutations images constraints clean plc-faults proof handshake-mutations handshake-walk handshake-soak
+.PHONY: help demo test lint format bench fuzz browser kills records-million kill-writers mutations images constraints clean plc-faults proof handshake-mutations handshake-walk handshake-soak

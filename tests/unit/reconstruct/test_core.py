@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import pytest
 
@@ -334,3 +335,38 @@ def test_timings_come_from_the_clock_that_is_passed() -> None:
     found = reconstruct(pixels, prepared(comb_calibration(COMB, PLATES)), lambda: float(next(ticks)))
     assert found.timings_ms["stripes"] == 1000.0
     assert found.timings_ms["total"] == sum(v for k, v in found.timings_ms.items() if k != "total")
+
+
+def told(pixels: np.ndarray) -> str:
+    """Sentences of a frame, or the reason why it was refused."""
+    try:
+        return " ".join(reconstruct(pixels, prepared(comb_calibration(COMB, PLATES))).quality.sentences)
+    except FrameError as refused:
+        return str(refused)
+
+
+def frame_of(comb: Comb = COMB, seed: int = 65) -> np.ndarray:
+    return draw(comb, plate(2.0), seed)[0]
+
+
+@pytest.mark.parametrize(
+    ("pixels", "words"),
+    [
+        (frame_of(), ()),
+        (np.where(np.arange(640) < 320, frame_of(), 0).astype(np.uint8), ("Only 5",)),
+        (np.roll(frame_of(), 150, 1), ("spot", "column 47", "moved")),
+        (frame_of(replace(COMB, pitch_px=30.0)), ("79%", "not the calibrated head")),
+        (frame_of(replace(COMB, dead=(2, 7))), ("2 of 11", "line 2, 7", "dead")),
+        (frame_of(replace(COMB, spot_px=0.0)), ("centre spot was not found",)),
+        (frame_of(replace(COMB, signal_dn=900.0)), ("saturated", "shorten")),
+        (frame_of(replace(COMB, ambient_dn=170.0)), ("Ambient light", "shade")),
+        (cv2.GaussianBlur(frame_of(), (0, 0), 3.0), ("times as broad", "focus", "shakes")),
+        (frame_of(replace(COMB, signal_dn=9.0)), ("DN above the background", "lengthen")),
+    ],
+    ids=["good", "half", "shifted", "wrong head", "dead lines", "no spot", "saturated", "ambient", "blurred", "dim"],
+)
+def test_a_frame_says_what_is_wrong_with_it(pixels: np.ndarray, words: tuple[str, ...]) -> None:
+    text = told(pixels)
+    assert all(word in text for word in words), text
+    if not words:
+        assert text == ""

@@ -160,6 +160,7 @@ def _report(calibration: Calibration, path: Path, name: str, limits: Calibration
         f"  heights {low:.2f} to {high:.2f} mm, {1e3 * abs(meta['mm_per_line_px']):.1f} um per px of line"
         f" shift, calibration uncertainty {1e3 * float(np.nanmedian(calibration.z_sigma_mm)):.1f} um,"
         f" vibration {meta['vibration_px']:.3f} px"
+        + (": WARNING, the head or the plates shake; hold them firmly" if meta["vibration_px"] > 0.2 else "")
     )
     if np.isfinite(calibration.mm_per_pixel):
         lateral = meta.get("lateral")

@@ -27,7 +27,7 @@ from wearline_reconstruct.core.numbering import (
     number_by_gate,
     number_fragments,
 )
-from wearline_reconstruct.core.quality import check_pixels, check_stripes, describe
+from wearline_reconstruct.core.quality import Numbered, check_pixels, check_stripes, describe, stripe_width
 from wearline_reconstruct.core.smoothing import SmoothingSettings, smooth
 from wearline_reconstruct.core.spot import Search, Spot, find_spots
 from wearline_reconstruct.core.stripes import (
@@ -207,7 +207,8 @@ def reconstruct(
     lap("lines")
     number, spot = _numbered(strip, found, prepared)
     lap("numbering")
-    result = _measured(found, number, spot, prepared)
+    width_px = stripe_width(strip, found.peaks, prepared.scale)
+    result = _measured(found, number, spot, width_px, prepared)
     lap("heights")
     return Reconstruction(
         result.points,
@@ -252,6 +253,8 @@ def _numbered(strip: Image, found: Fragments, prepared: Prepared) -> tuple[I64, 
     """Line number per peak, and the spot."""
     calibration, pitch = prepared.calibration, prepared.scale.pitch_px
     spots = find_spots(strip, prepared.scale, prepared.search) if prepared.search else []
+    if prepared.search is not None and not spots:
+        _refuse_spot_elsewhere(strip, prepared)
     if prepared.gate is not None:
         number = number_by_gate(found, prepared.gate)
         spot = _check_against_template(number, found, spots, prepared.gate, prepared)
@@ -305,6 +308,25 @@ def _spots_in_range(spots: list[Spot], prepared: Prepared) -> list[Spot]:
             cure="check the part's position or calibrate a larger range", code=int(ResultCode.REGISTRATION),
         )  # fmt: skip
     return inside
+
+
+def _refuse_spot_elsewhere(strip: Image, prepared: Prepared) -> None:
+    """A clear spot where this head cannot have it: another head, or the camera has moved.
+
+    Raises:
+        FrameError: 22.
+    """
+    assert prepared.search is not None
+    for spot in find_spots(strip, prepared.scale)[:1]:
+        if spot.excess > _CLEAR_SPOT * max(prepared.search.least_excess, 0.4):
+            row, col = (
+                (spot.along_px, spot.across_px) if prepared.calibration.is_vertical else (spot.across_px, spot.along_px)
+            )  # fmt: skip
+            raise FrameError(
+                f"shows the centre spot at row {row:.0f}, column {col:.0f}, where this head cannot have it",
+                cure="check that this is the calibrated head, that nothing has moved, and the part's position",
+                code=int(ResultCode.REGISTRATION),
+            )  # fmt: skip
 
 
 def _check_whole_comb(found: Fragments, number: I64, calibration: Calibration) -> None:
@@ -370,7 +392,9 @@ class _Measured:
     quality: FrameQuality
 
 
-def _measured(found: Fragments, number: I64, spot: Spot | None, prepared: Prepared) -> _Measured:
+def _measured(
+    found: Fragments, number: I64, spot: Spot | None, width_px: float | None, prepared: Prepared
+) -> _Measured:
     calibration, recipe = prepared.calibration, prepared.recipe
     lines, along_size = calibration.across0_px.shape
     keep = _one_each(number, found, (lines, along_size))
@@ -385,6 +409,7 @@ def _measured(found: Fragments, number: I64, spot: Spot | None, prepared: Prepar
             f"lies at {float(np.nanmedian(z)):.2f} mm, outside the calibrated {low:.2f} to {high:.2f} mm",
             cure="check the part's position or calibrate a larger range", code=int(ResultCode.REGISTRATION),
         )  # fmt: skip
+    outside = float(1.0 - valid.mean())
     keep, line, along, across, z = keep[valid], line[valid], along[valid], across[valid], z[valid]
     slope = np.abs(height_slope(calibration, line, along, across))
     places = _Places(keep, line, along, z, slope)
@@ -412,9 +437,17 @@ def _measured(found: Fragments, number: I64, spot: Spot | None, prepared: Prepar
             "shows no measurable point in the region of interest", cure="check the recipe's roi and the part",
             code=int(ResultCode.COVERAGE),
         )  # fmt: skip
-    seen = int(np.count_nonzero(np.bincount(line[order])))
-    wanted = int((expected.sum(axis=1) > 0.1 * along_size).sum())
-    quality = describe(found, seen, max(wanted, seen), spot is not None, calibration.stripe_width_px, coverage)
+    count = np.bincount(line[order], minlength=lines)
+    wanted = np.flatnonzero((expected.sum(axis=1) > 0.1 * along_size) | (count > 0))
+    quality = describe(
+        found,
+        Numbered(
+            wanted=wanted, missing=wanted[count[wanted] == 0], spot_found=spot is not None, coverage=coverage,
+            outside=outside, unnamed=1.0 - len(keep) / max(len(found.peaks), 1),
+            pitch_ratio=_pitch_ratio(line, along, across, calibration),
+        ),
+        calibration.stripe_width_px, width_px,
+    )  # fmt: skip
     return _Measured(points, common, coverage, quality)
 
 
@@ -469,6 +502,15 @@ def _filtered_by_thesis(found: Fragments, places: _Places, prepared: Prepared) -
     grid_z[places.line, places.along] = places.z_mm
     filtered = spatial_kalman(grid_z, float(np.median(sigma[::19])), prepared.settings.thesis.iterations)
     return filtered.z_mm[places.line, places.along], sigma, np.zeros(len(sigma), bool)
+
+
+def _pitch_ratio(line: I64, along: I64, across: F64, calibration: Calibration) -> float:
+    """Distance of neighbouring lines over that on the plates, median."""
+    grid = np.full(calibration.across0_px.shape, np.nan)
+    thin = along % 16 == 0
+    grid[line[thin], along[thin]] = across[thin]
+    ratio = np.diff(grid[:, ::16], axis=0) / np.diff(calibration.across0_px[:, ::16], axis=0)
+    return float(np.nanmedian(ratio)) if np.isfinite(ratio).any() else 1.0
 
 
 def _one_each(number: I64, found: Fragments, shape: tuple[int, int]) -> I64:

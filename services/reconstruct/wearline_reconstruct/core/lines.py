@@ -252,15 +252,18 @@ def _breaks(peaks: Peaks, label: I64, sigma: F32, length: float, limit: float) -
     moments = np.concatenate([[0.0], np.cumsum(index * y)])
     i = np.arange(m + guard, n - m - guard)
 
-    def line_at(first: I64, at: I64) -> F64:
-        mean = (sums[first + m] - sums[first]) / m
-        centre = first + 0.5 * (m - 1)
-        slope = ((moments[first + m] - moments[first]) - centre * (sums[first + m] - sums[first])) / (
-            m * (m * m - 1.0) / 12.0
+    def line_at(first: I64, count: int, at: I64) -> F64:
+        mean = (sums[first + count] - sums[first]) / count
+        centre = first + 0.5 * (count - 1)
+        slope = ((moments[first + count] - moments[first]) - centre * (sums[first + count] - sums[first])) / (
+            count * (count * count - 1.0) / 12.0
         )
         return np.asarray(mean + slope * (at - centre))
 
-    jump = line_at(i + guard, i) - line_at(i - guard - m + 1, i)
+    def jump_at(at: I64, count: int) -> F64:
+        return line_at(at + guard, count, at) - line_at(at - guard - count + 1, count, at)
+
+    jump = jump_at(i, m)
     distance = 0.5 * (m - 1) + guard
     variance = 2.0 * sigma[i].astype(np.float64) ** 2 * length * (1.0 / m + distance**2 / (m * (m * m - 1.0) / 12.0))
     whole = label[i + guard + m - 1] == label[i - guard - m + 1]
@@ -271,6 +274,9 @@ def _breaks(peaks: Peaks, label: I64, sigma: F32, length: float, limit: float) -
     peak = np.flatnonzero((excess > limit) & (excess >= highest) & (np.abs(jump) > 0.35))
     if not len(peak):
         return broken, doubtful
+    # Seen from close by, a jump is as high as from afar; what is left of a wall's bend is a tenth.
+    near = jump_at(i[peak], max(m // 3, 6))
+    peak = peak[np.abs(near) > 0.5 * np.abs(jump[peak])]
     at = i[peak]
     broken[at] = True
     for offset in range(-guard - 1, guard + 1):
