@@ -53,6 +53,8 @@ from wearline_fieldbus.core.handshake import Handshake, Recovered
 from wearline_fieldbus.core.profiles import Direction, Profile, image_rows
 from wearline_fieldbus.drivers.journal import Journal as JournalFile
 from wearline_fieldbus.drivers.memory import MemoryPlc
+from wearline_fieldbus.drivers.modbus import DigitalIo, ModbusServer
+from wearline_fieldbus.drivers.modbus_protocol import Area
 from wearline_fieldbus.drivers.plc import (
     ImageRead,
     LinkDown,
@@ -64,6 +66,7 @@ from wearline_fieldbus.drivers.plc import (
     WriteSkipped,
 )
 from wearline_fieldbus.drivers.s7 import S7Plc
+from wearline_fieldbus.drivers.s7_server import ServedImage
 
 CYCLES = counter("wearline_cycles_total", "Cycles that ended, by what was decided", ("cell", "object", "decision"))
 CYCLE = histogram("wearline_cycle_seconds", "From the Measure edge to the result acknowledged by the PLC", ("cell",))
@@ -73,6 +76,8 @@ POLL = histogram(
     buckets=(0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.5),
 )  # fmt: skip
 
+ServeModbus = Callable[[Callable[[], bytes]], ModbusServer | None]
+"""Starts the Modbus server, if there is one, on what gives the newest image."""
 TICK_S = 0.05
 ROOM_S = 1.0
 """Between two looks at the disk. [s]"""
@@ -96,10 +101,13 @@ class Fieldbus(Service):
         handshake: Handshake,
         link: PlcLink,
         journal: JournalFile,
+        serve_modbus: ServeModbus = lambda image: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._cell, self._profile, self._clock = cell, profile, clock
         self._handshake, self._link, self._journal = handshake, link, journal
+        self._serve_modbus = serve_modbus
+        self._modbus: ModbusServer | None = None
         self._asker: Asker | None = None
         self._connection = 0
         self._image = bytes(profile.size)
@@ -131,6 +139,7 @@ class Fieldbus(Service):
         self._has_room = self._journal.check_room()
         yield from self._feed(c.RoomChanged(self._has_room))
         LINK_UP.labels(self._cell).set(0.0)
+        self._modbus = self._serve_modbus(lambda: self._image)
         self._link.wake = self.wake
         self._link.start()
 
@@ -224,6 +233,8 @@ class Fieldbus(Service):
         return Health("ready", "", values)
 
     def close(self) -> None:
+        if self._modbus is not None:
+            self._modbus.close()
         self._link.close()
         self._journal.close()
 
@@ -401,15 +412,38 @@ def build(cell: CellSettings, settings: FieldbusSettings) -> Service:
         # Unique for ever: the instant, and chance for a clock that was set back.
         cycle_prefix=f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{secrets.token_hex(3)}",
     )
-    port: PlcPort
-    if settings.plc.kind == "memory":
-        port = MemoryPlc(profile.size)
-    else:
-        port = S7Plc(settings.plc, profile.size, settings.handshake.io_timeout_s)
+    port, modbus = _ports(settings, profile)
     link = PlcLink(
         port,
         poll_s=settings.plc.poll_ms / 1000.0,
         quiet=profile.life_bytes,
         observe_poll=POLL.labels(cell.cell).observe,
     )
-    return Fieldbus(cell.cell, profile, handshake, link, JournalFile(cell.data_folder("fieldbus"), settings.journal))
+    journal = JournalFile(cell.data_folder("fieldbus"), settings.journal)
+    return Fieldbus(cell.cell, profile, handshake, link, journal, modbus)
+
+
+def _ports(settings: FieldbusSettings, profile: Profile) -> tuple[PlcPort, ServeModbus]:
+    """The way to the PLC, and what starts the Modbus server on the image that the service has last seen."""
+    plc, timeout_s = settings.plc, settings.handshake.io_timeout_s
+    memory = MemoryPlc(profile.size)
+    start, end = profile.span(Direction.REQUEST)
+    # Only where the PLC itself is the client: else the request has another writer.
+    writable = range(start // 2, end // 2) if plc.kind == "modbus" else range(0)
+
+    def serve(image: Callable[[], bytes]) -> ModbusServer | None:
+        if settings.modbus.port is None:
+            return None
+        source = memory.read if plc.kind == "modbus" else image
+        return ModbusServer(settings.modbus, lambda: Area(source(), writable), memory.put)
+
+    port: PlcPort
+    if plc.kind == "s7":
+        port = S7Plc(plc, profile.size, timeout_s)
+    elif plc.kind == "s7_server":
+        port = ServedImage(plc.host, plc.port, plc.db, profile.size)
+    elif plc.kind == "digital_io":
+        port = DigitalIo(settings.digital_io, profile.size, timeout_s)
+    else:
+        port = memory
+    return port, serve

@@ -78,9 +78,51 @@ class S7Server:
         finally:
             self._server.unlock_area(SrvArea.DB, self._db)
 
+    def put(self, start: int, content: bytes) -> None:
+        """Change some bytes in one piece."""
+        with self.memory() as memory:
+            memory[start : start + len(content)] = content
+
     def close(self) -> None:
         """Stop, and end every connection."""
         self._server.running = False
         self._server.drop_clients()
         self._server.running = True
         self._server.stop()
+
+
+class ServedImage:
+    """The other way round: the image lies here, and the PLC reads and writes it as an S7 client (PUT and GET).
+
+    Whether the PLC is there is told by its life counter alone.
+    """
+
+    def __init__(self, host: str, port: int, db: int, size: int) -> None:
+        self.name = f"S7 server {host}:{port}"
+        self._place = (host, port, db, size)
+        self._server: S7Server | None = None
+
+    @property
+    def port(self) -> int:
+        """Where it listens, once it does."""
+        return 0 if self._server is None else self._server.port
+
+    def connect(self) -> None:
+        if self._server is None:
+            self._server = S7Server(*self._place)
+
+    def read(self) -> bytes:
+        if self._server is None:
+            raise DeviceError("is not connected", self.name, "connect first")
+        with self._server.memory() as memory:
+            return bytes(memory)
+
+    def write(self, start: int, content: bytes) -> None:
+        if self._server is None:
+            raise DeviceError("is not connected", self.name, "connect first")
+        self._server.put(start, content)
+
+    def close(self) -> None:
+        server, self._server = self._server, None
+        if server is not None:
+            server.close()
