@@ -230,7 +230,7 @@ class Vision:
 
     def __init__(self, port: int) -> None:
         self.plc = S7Plc(S7Settings(port=port), BASIC.size, 0.4)
-        until(self._connects)
+        until(self._connects, 40.0)
 
     def _connects(self) -> bool:
         try:
@@ -311,7 +311,7 @@ def test_the_soft_plc_says_why_it_cannot_start(tmp_path: Path) -> None:
     server = S7Server("127.0.0.1", 0, 1, 20)
     try:
         process = start_plc_sim(tmp_path, server.port)
-        assert process.wait(timeout=20) == 2
+        assert process.wait(timeout=60) == 2
         assert "free the port" in (tmp_path / "plc.log").read_text()
     finally:
         server.close()
