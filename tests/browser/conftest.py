@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import ssl
 import subprocess
 import sys
 import time
@@ -45,10 +46,10 @@ class Hmi:
         return time.monotonic() - start_s
 
 
-def answers(url: str) -> bool:
+def answers(url: str, trusting: ssl.SSLContext | None = None) -> bool:
     """Whether something serves there."""
     try:
-        with urllib.request.urlopen(url, timeout=1):
+        with urllib.request.urlopen(url, timeout=1, context=trusting):
             return True
     except OSError:
         return False
@@ -90,16 +91,16 @@ def add_users(path: Path) -> None:
     accounts.close()
 
 
-def start_hmi(path: Path) -> Hmi:
-    """Run the service and wait until it serves."""
+def start_hmi(path: Path, trusting: ssl.SSLContext | None = None) -> Hmi:
+    """Run the service and wait until it serves; with a context by https."""
     log = path.parent / "hmi.log"
     with log.open("wb") as stream:
         process = subprocess.Popen(
             [sys.executable, "-m", "wearline_hmi", "--config", str(path)],
             stdout=stream, stderr=stream, cwd=path.parent, env={**os.environ, "PYTHONUNBUFFERED": "1"},
         )  # fmt: skip
-    url = f"http://127.0.0.1:{load_cell(path).hmi['port']}"
-    until(lambda: process.poll() is not None or answers(url + "/static/wearline.svg"), 30)
+    url = f"http{'s' if trusting else ''}://127.0.0.1:{load_cell(path).hmi['port']}"
+    until(lambda: process.poll() is not None or answers(url + "/static/wearline.svg", trusting), 30)
     assert process.poll() is None, log.read_text()
     return Hmi(process, url, log)
 

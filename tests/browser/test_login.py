@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import http.client
 import re
+import shutil
+import ssl
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from urllib.parse import urlencode, urlsplit
 
 import pytest
 from playwright.sync_api import Browser, expect
 
-from tests.browser.conftest import PASSWORD, Hmi, Visit, start_hmi, write_cell
+from tests.browser.conftest import PASSWORD, Hmi, Visit, add_users, start_hmi, write_cell
 from tests.browser.feed import Feed
 from wearline.config import load_cell
 from wearline_hmi.core.rights import Role
@@ -83,3 +88,42 @@ def test_look_and_language_are_chosen_by_keyboard_and_kept(visit: Callable[..., 
     page.goto(hmi.url + "/")
     expect(page.locator("body.body--dark")).to_be_attached()
     assert page.evaluate("document.documentElement.lang") == "de"
+
+
+def test_with_a_certificate_it_speaks_tls_alone_and_keeps_the_cookie_to_it(tmp_path: Path) -> None:
+    if shutil.which("openssl") is None:
+        pytest.skip("needs openssl to make a certificate")
+    certificate, key = tmp_path / "hmi.pem", tmp_path / "hmi.key"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2",
+         "-subj", "/CN=press7", "-addext", "subjectAltName=IP:127.0.0.1", "-out", str(certificate),
+         "-keyout", str(key)],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    path = write_cell(
+        tmp_path, view_without_login=False, tls_certificate=str(certificate), tls_key=str(key), host="127.0.0.1"
+    )
+    add_users(path)
+    feed = Feed(load_cell(path))
+    trusting = ssl.create_default_context(cafile=str(certificate))
+    running = start_hmi(path, trusting)
+    try:
+        assert running.url.startswith("https://")
+        place = urlsplit(running.url)
+        connection = http.client.HTTPSConnection(place.hostname or "", place.port, context=trusting, timeout=5)
+        body = urlencode({"name": "ada", "password": PASSWORD})
+        headers = {"Origin": running.url, "Content-Type": "application/x-www-form-urlencoded"}
+        connection.request("POST", "/login", body, headers)
+        answer = connection.getresponse()
+        assert answer.status == 303
+        cookie = answer.headers["Set-Cookie"]
+        assert cookie.startswith("__Host-wearline_session=")
+        assert "; Secure" in cookie
+        connection.close()
+        plain = http.client.HTTPConnection(place.hostname or "", place.port, timeout=5)
+        with pytest.raises((http.client.HTTPException, OSError)):
+            plain.request("GET", "/login")
+            plain.getresponse()
+    finally:
+        running.stop()
+        feed.close()
