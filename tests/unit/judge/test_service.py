@@ -467,6 +467,8 @@ def test_wear_rises_towards_the_limit_and_a_die_event_starts_anew(make: Callable
     assert trend.remaining_p10 <= trend.remaining_p50 <= trend.remaining_p90
     assert trend.remaining_p50 == pytest.approx((0.5 - 0.33) / 0.000975, rel=0.25)
     assert trend.strokes_since_service == 230 and len(trend.points) == 24
+    text = generate_latest(REGISTRY).decode()
+    assert 'wearline_remaining_strokes{cell="test",object="1",quantile="0.5",zone="part"} 1' in text
     done = cell.judge.on_die_event(DieEvent(object_index=1, kind="regrind", user="ada"))
     assert done.ok and "240" in done.text
     (trend,) = cell.records().trends
@@ -478,7 +480,7 @@ def test_wear_rises_towards_the_limit_and_a_die_event_starts_anew(make: Callable
     assert not cell.judge.on_die_event(DieEvent(object_index=5, kind="polish")).ok
     text = generate_latest(REGISTRY).decode()
     assert 'wearline_strokes_since_service{cell="test",object="1"} 10.0' in text
-    assert 'wearline_remaining_strokes{cell="test",object="1",quantile="0.5",zone="part"} NaN' in text
+    assert 'wearline_remaining_strokes{cell="test",object="1",quantile="0.5",zone="part"}' not in text
     assert 'wearline_wear_millimeters{cell="test",object="1",zone="part"} 0.1' in text
 
 

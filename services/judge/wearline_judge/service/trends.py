@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 
 import numpy as np
+from prometheus_client import Gauge
 
 from wearline.errors import RecordError, WearlineError
 from wearline.messages import DieEvent, Verdict, WearTrend
@@ -26,7 +27,7 @@ from wearline_judge.drivers.references import References
 from wearline_judge.drivers.tables import PART
 
 MEAN_ERROR = gauge("wearline_mean_error_millimeters", "Mean error of the newest measured part", ("cell", "object"))
-WEAR = gauge("wearline_wear_millimeters", "Wear of the newest measured part", ("cell", "object", "zone"))
+WEAR = gauge("wearline_wear_millimeters", "Wear, as the trend sees it now", ("cell", "object", "zone"))
 SLOPE = gauge("wearline_wear_slope_millimeters_per_kilostroke", "Slope of the wear trend", ("cell", "object", "zone"))
 REMAINING = gauge("wearline_remaining_strokes", "Strokes until the wear limit", ("cell", "object", "zone", "quantile"))
 ALARM = gauge(
@@ -71,14 +72,9 @@ class Trends:
     def measured(self, verdict: Verdict, comparison: Comparison | None, setup: Setup | None) -> None:
         """A part was measured: its figures for the metrics, its cells for the wear map."""
         index = verdict.request.object_index
-        place = (self._cell, str(index))
         if verdict.mean_error_mm is None:
             return
-        MEAN_ERROR.labels(*place).set(verdict.mean_error_mm)
-        WEAR.labels(*place, WHOLE).set(verdict.wear_mm or 0.0)
-        for zone in verdict.zones:
-            if zone.wear_mm is not None:
-                WEAR.labels(*place, zone.name).set(zone.wear_mm)
+        MEAN_ERROR.labels(self._cell, str(index)).set(verdict.mean_error_mm)
         if comparison is None or setup is None:
             return
         life = self._life(index)
@@ -259,13 +255,12 @@ class Trends:
         if zone == PART:
             SINCE_SERVICE.labels(*place).set(trend.strokes_since_service)
         ALARM.labels(*place, name).set(trend.alarm_level)
-        nan = float("nan")  # what is not identifiable must not keep its last value on a dashboard
-        slope = trend.slope_mm_per_kilostroke
-        SLOPE.labels(*place, name).set(nan if slope is None else slope)
+        _tell(WEAR, (*place, name), trend.wear_mm)
+        _tell(SLOPE, (*place, name), trend.slope_mm_per_kilostroke)
         for quantile, strokes in (
             ("0.1", trend.remaining_p10), ("0.5", trend.remaining_p50), ("0.9", trend.remaining_p90)
         ):  # fmt: skip
-            REMAINING.labels(*place, name, quantile).set(nan if strokes is None else strokes)
+            _tell(REMAINING, (*place, name, quantile), strokes)
 
     def _alarm(self, index: int, zone: str) -> Alarm:
         found = next((a for a in self._records.alarms(index) if a.zone == zone), None)
@@ -278,6 +273,15 @@ class Trends:
     def _keep_map(self, index: int, life: _Life) -> None:
         if life.wear is not None:
             self._records.keep_map(index, StoredMap(life.wear.square_px, life.wear.origin_px, life.wear.arrays()))
+
+
+def _tell(series: Gauge, labels: tuple[str, ...], value: float | None) -> None:
+    """What is not known must not keep its last value on a dashboard: the series goes."""
+    if value is not None:
+        series.labels(*labels).set(value)
+        return
+    with suppress(KeyError):
+        series.remove(*labels)
 
 
 def _alarm(stored: StoredAlarm) -> Alarm:
