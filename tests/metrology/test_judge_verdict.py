@@ -35,16 +35,18 @@ def grid() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 @cache
-def golden_setup(recipe: Recipe) -> Setup:
+def golden_setup(recipe: Recipe, is_vertical: bool = False) -> Setup:
     row, col = grid()
     z = heights(row, col)
     rows = int(30 + PITCH * LINES)
     field = heights(*(a.astype(np.float64) for a in np.mgrid[0:rows, 0:ALONG])).astype(np.float32)
     even = np.full(z.shape, 1.0, np.float32)
+    shown = np.ascontiguousarray(field.T) if is_vertical else field
     template = Template(
         line_across_px=row.astype(np.float32), line_z_mm=z.astype(np.float32), line_sigma_mm=even * 1e-4,
-        line_spread_mm=even * 1e-4, line_coverage=even, z_map_mm=field, roi=np.array([0, 0, ALONG, rows], np.int32),
-        calibration_hash="c", recipe_hash="r", frames=1, meta={"is_vertical": False, "mm_per_pixel": SCALE},
+        line_spread_mm=even * 1e-4, line_coverage=even, z_map_mm=shown,
+        roi=np.array([0, 0, *((rows, ALONG) if is_vertical else (ALONG, rows))], np.int32),
+        calibration_hash="c", recipe_hash="r", frames=1, meta={"is_vertical": is_vertical, "mm_per_pixel": SCALE},
     )  # fmt: skip
     return make_setup(make_golden(template, SCALE), recipe)
 
@@ -137,3 +139,15 @@ def test_without_a_guard_band_half_of_the_parts_at_the_limit_pass() -> None:
 def test_parts_without_wear_pass() -> None:
     found = decisions(0.0, 0.05, 60, 5)
     assert found == {Decision.PASSED: 60}
+
+
+def test_a_picture_turned_by_a_quarter_is_judged_alike() -> None:
+    lying = part(0.2, 8)
+    standing = lying.model_copy(update={"points": np.ascontiguousarray(lying.points[:, [0, 2, 1, 3, 4]])})
+    along = judge_points(lying, golden_setup(Recipe()), JudgingSettings())
+    across = judge_points(standing, golden_setup(Recipe(orientation="vertical"), True), JudgingSettings())
+    assert along.comparison is not None and across.comparison is not None
+    np.testing.assert_allclose(along.comparison.deviation_mm, across.comparison.deviation_mm, atol=1e-5)
+    (first,), (second,) = along.fields["regions"], across.fields["regions"]
+    assert (first.row_px, first.col_px) == pytest.approx((second.col_px, second.row_px))
+    assert first.mean_mm == pytest.approx(second.mean_mm)
