@@ -82,6 +82,9 @@ handshake-walk: .venv/ready-dev ## 10^5 random triggers of the real handshake ag
 handshake-soak: .venv/ready-dev ## 10^6 of them
 	@WEARLINE_WALK_TRIGGERS=1000000 .venv/bin/python -m pytest tests/proof/test_walk.py $(T)
 
+plc-bench: .venv/ready-dev ## Jitter and CPU of the PLC poll, time from verdict to PLC
+	@.venv/bin/python -m tests.faults.plc_bench
+
 images: ## Container images of all services (needs Docker with BuildKit)
 	@deploy/images.sh
 
@@ -91,4 +94,4 @@ constraints: .venv/ready-dev ## Pin all third-party packages anew
 clean: ## Forget the environment and the demo's data
 	rm -rf .venv run build
 
-.PHONY: help demo test lint format bench fuzz browser kills records-million kill-writers mutations images constraints clean plc-faults proof handshake-mutations handshake-walk handshake-soak
+.PHONY: help demo test lint format bench fuzz browser kills records-million kill-writers mutations images constraints clean plc-faults plc-bench proof handshake-mutations handshake-walk handshake-soak

@@ -189,6 +189,9 @@ class PlcCell:
         self.parts: dict[str, int] = {}
         self.outcomes: list[m.Outcome] = []
         self.events: list[m.Event] = []
+        self.judged_s: dict[str, float] = {}
+        self.told_s: dict[str, float] = {}
+        """When each verdict was handed over, and its outcome published. [s]"""
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
@@ -226,6 +229,7 @@ class PlcCell:
                 timer.start()
             elif isinstance(message, m.Outcome):
                 self.outcomes.append(message)
+                self.told_s[message.cycle_id] = time.monotonic()
             elif isinstance(message, m.Event):
                 self.events.append(message)
 
@@ -236,6 +240,7 @@ class PlcCell:
             decision=m.Decision.PASSED if good else m.Decision.FAILED, code=1 if good else 2,
         )  # fmt: skip
         with self._changed:
+            self.judged_s[request.cycle_id] = time.monotonic()
             self._verdicts.append(verdict)
             self._changed.notify()
 
