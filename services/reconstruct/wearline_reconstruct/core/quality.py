@@ -69,13 +69,13 @@ class Numbered:
 
 
 def stripe_width(strip: Image, peaks: Peaks, scale: Scale) -> float | None:
-    """Gaussian sigma of the stripes as area over height, from some hundred of them; None without any. [px]
+    """Gaussian sigma of the stripes as area over height, from a hundred of them and more; None without any. [px]
 
     The windows of the extraction suit the calibrated width; a stripe out of focus does not fit them.
     """
     if not len(peaks):
         return None
-    some = np.arange(0, len(peaks), max(1, len(peaks) // 400))
+    some = np.arange(0, len(peaks), max(1, len(peaks) // 150))
     pitch = scale.pitch_px if np.isfinite(scale.pitch_px) else 20.0 * scale.width_px
     half = int(max(min(0.45 * pitch, 8.0 * scale.width_px), 4.0))
     along = np.clip(peaks.along[some].astype(np.int64)[:, None] + np.arange(-3, 4), 0, strip.shape[0] - 1)
