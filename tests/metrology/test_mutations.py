@@ -74,3 +74,12 @@ def test_mutated_frames_never_break_the_chain(count: int) -> None:
         assert (points[:, 3] > low - 0.5).all() and (points[:, 3] < high + 0.5).all(), seed
         assert 0.0 <= found.coverage <= 1.0, seed
     assert 0.05 * count < measured < 0.95 * count
+
+
+def test_lines_that_fit_no_number_are_refused() -> None:
+    """A frame whose fragments have not one candidate between them."""
+    chain = prepared(comb_calibration(COMB, (0.0, 0.0, 3.0, 3.0, 6.0, 6.0)))
+    strange = Comb(lines=1, pitch_px=40.0, slant=0.6, bow_px=0.0, spot_px=0.0)
+    pixels = draw(strange, plate(0.0), 78)[0]
+    with pytest.raises(FrameError):
+        reconstruct(pixels, chain)

@@ -182,6 +182,9 @@ def number_fragments(
     base = np.where(share >= 0.7, 4.0 * (1.0 - share), _NEVER)
     _fix_by_hand(base, along, across, node, pitch_px, constraints, calibration)
     candidates, unary = _candidates(base)
+    if candidates.slots < 2:
+        # No fragment fits any line.
+        return Numbers(number, margin)
     signal = peaks.signal_dn[use].astype(np.float64)
     strength = np.add.reduceat(signal, starts) / total / max(float(np.median(signal)), 1e-6)
     unary[:, -1] = 1.5 * total * np.clip(strength, 0.1, 1.0) + 0.5
