@@ -26,6 +26,8 @@ from wearline_judge.drivers.chain import key_of
 from wearline_judge.drivers.lock import FolderLock
 from wearline_judge.drivers.records import RecordStore, open_engine, sqlite_url
 
+pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+
 Recorded = tuple[Path, Verdict]
 Capture = pytest.CaptureFixture[str]
 

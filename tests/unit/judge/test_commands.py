@@ -15,6 +15,8 @@ from wearline.cli import main
 from wearline.messages import Decision, ResultCode, Verdict
 from wearline_judge.commands.replay import differences
 
+pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+
 KEYS = {
     "frame", "decision", "reason", "code", "mean_error_mm", "max_error_mm", "wear_mm", "deviating_area_mm2",
     "deviating_area_px", "coverage", "regions", "zones", "registration", "timings_ms",

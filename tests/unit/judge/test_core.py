@@ -28,6 +28,8 @@ from wearline_judge.core.line_grid import line_grid
 from wearline_judge.core.teaching import Sample, teach
 from wearline_judge.core.view import make_view
 
+pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+
 SETTINGS = JudgingSettings()
 TEMPLATE = golden_template()
 FLAW_MM2 = np.pi * FLAW[2] * FLAW[3] * MM_PER_PIXEL**2
@@ -144,6 +146,10 @@ def test_the_roi_bounds_what_is_judged() -> None:
     found = judge_points(line_points(Part(flaw_mm=0.5), recipe=recipe), setup(recipe, template), SETTINGS).fields
     assert found["decision"] is Decision.PASSED
     assert template.z_map_mm.shape == (480, 200)
+    seen = judge_points(line_points(Part(), recipe=recipe), setup(recipe, template), SETTINGS)
+    assert seen.comparison is not None
+    maps, _ = make_view(make_golden(template, None), seen.comparison)
+    assert maps.shape[0] == 4 and np.isfinite(maps[2]).mean() > 0.5
 
 
 def test_without_a_lateral_scale_areas_are_pixels() -> None:

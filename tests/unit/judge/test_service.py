@@ -58,6 +58,8 @@ from wearline_judge.drivers.references import StoredReferences
 from wearline_judge.service import Judge, Stores, open_stores
 from wearline_judge.service.trends import ALARM
 
+pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+
 TEMPLATE_BYTES = golden_template().to_bytes()
 START = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
 

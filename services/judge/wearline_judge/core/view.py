@@ -45,7 +45,9 @@ def make_view(golden: Golden, comparison: Comparison, longest: int = 160) -> tup
         comparison.label > 0, comparison.deviation_mm, np.where(np.isnan(comparison.deviation_mm), np.nan, 0.0)
     )
     # Nearest cell along the line: cells are no longer than a step.
-    centre = np.nanmean(along, axis=0)
+    has = np.isfinite(along)
+    count = has.sum(axis=0)
+    centre = np.where(count > 0, np.where(has, along, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
     known = np.flatnonzero(np.isfinite(centre))
     if not known.size:
         return np.full((4, *standard.shape), np.nan, np.float32), float(step)
