@@ -87,6 +87,7 @@ class Feed:
         self._outcomes: dict[str, m.Outcome] = {}
         self._preview: m.Preview | None = None
         self._view: m.View | None = None
+        self.alarm_level, self.acknowledged = 0, ("", "")
         self._die_events: list[tuple[int, str]] = []
         self._lock = threading.Lock()
         self._stop = threading.Event()
@@ -259,6 +260,7 @@ class Feed:
         self._answer("judge", topics.RECIPE, self._recipe)
         self._answer("judge", topics.TEACH, lambda _: m.Done(ok=True, text="object 1: version 3, taught from 3 parts"))
         self._answer("judge", topics.DIE_EVENT, self._on_die_event)
+        self._answer("judge", topics.ACKNOWLEDGE, self._on_acknowledge)
         self._answer("fieldbus", topics.MODE, self._on_mode)
         self._answer("fieldbus", topics.SELECT_OBJECT, self._on_select)
         self._answer("fieldbus", topics.DO_MEASURE, self._on_measure)
@@ -275,6 +277,11 @@ class Feed:
             stroke = self._verdicts[-1].request.stroke if self._verdicts else 0
             self._die_events.append((stroke, f"{wanted.kind}: {wanted.note}" if wanted.note else wanted.kind))
         return m.Done(ok=True, text=f"{wanted.kind} of object {wanted.object_index} recorded at stroke {stroke}")
+
+    def _on_acknowledge(self, wanted: m.Message) -> m.Done:
+        assert isinstance(wanted, m.Acknowledge)
+        self.acknowledged = (wanted.user, wanted.reason)
+        return m.Done(ok=True, text="acknowledged")
 
     def _on_mode(self, wanted: m.Message) -> m.Done:
         assert isinstance(wanted, m.SetMode)
@@ -358,7 +365,9 @@ class Feed:
                 slope_sigma=0.09, limit_mm=LIMIT_MM, remaining_p10=None if left is None else 0.7 * left,
                 remaining_p50=left, remaining_p90=None if left is None else 1.5 * left,
                 strokes_since_service=last - (self._die_events[-1][0] if self._die_events else 0),
-                die_events=tuple(self._die_events),
+                die_events=tuple(self._die_events), alarm_level=self.alarm_level,
+                alarm_reason="limit in fewer than 20 strokes" if self.alarm_level else "", alarm_stroke=last,
+                acknowledged_by=self.acknowledged[0], acknowledged_reason=self.acknowledged[1],
             ),
         )  # fmt: skip
 

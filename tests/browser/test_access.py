@@ -69,6 +69,7 @@ def test_the_screens_speak_german_and_chinese(visit: Callable[..., Visit], feed:
         assert page.evaluate("document.documentElement.lang") == language
 
 
+@pytest.mark.slow
 def test_a_phone_sees_everything_without_scrolling_sideways(visit: Callable[..., Visit]) -> None:
     guest = visit("ada", size=(390, 800))
     page = guest.context.new_page()

@@ -90,6 +90,7 @@ def test_look_and_language_are_chosen_by_keyboard_and_kept(visit: Callable[..., 
     assert page.evaluate("document.documentElement.lang") == "de"
 
 
+@pytest.mark.slow
 def test_with_a_certificate_it_speaks_tls_alone_and_keeps_the_cookie_to_it(tmp_path: Path) -> None:
     if shutil.which("openssl") is None:
         pytest.skip("needs openssl to make a certificate")

@@ -30,8 +30,8 @@ def test_products_are_searched_on_the_server_and_one_click_shows_why(visit: Call
     page.get_by_label("Part or stroke").fill("a4051")
     page.keyboard.press("Enter")
     expect(products).to_have_count(1)
-    asked = [q for q in feed.asked if isinstance(q, m.AskRecords)][-1]
-    assert (asked.search, asked.with_trends) == ("a4051", False)
+    asked = [q for q in feed.asked if isinstance(q, m.AskRecords) and q.search]
+    assert {(q.search, q.with_trends) for q in asked} == {("a4051", False)}
     page.get_by_role("button", name="51", exact=True).focus()
     page.keyboard.press("Enter")
     detail = page.locator(".detail")
@@ -72,6 +72,27 @@ def test_a_die_service_is_logged_by_maintenance_and_shows_in_the_trend(
     assert accounts.audit(1)[0].deed == "log a die service"
     page = visit("olga").open("/production")
     expect(page.get_by_role("button", name="Log the service")).to_be_disabled()
+
+
+def test_a_wear_alarm_is_seen_on_every_screen_and_acknowledged_with_a_reason(
+    visit: Callable[..., Visit], feed: Feed, accounts: Accounts
+) -> None:
+    feed.alarm_level = 3
+    try:
+        page = visit("mats").open("/production")
+        expect(page.locator(".fact-wear .sign.red")).to_have_text("action")
+        alarm = page.locator(".area-alarms tbody tr").first
+        expect(alarm).to_contain_text("limit in fewer than 20 strokes")
+        button = page.get_by_role("button", name="Acknowledge")
+        button.click()
+        expect(page.get_by_role("alert").filter(has_text="says why")).to_be_visible()
+        page.get_by_label("Reason").fill("die is ordered")
+        button.click()
+        expect(alarm).to_contain_text("mats: die is ordered")
+        assert accounts.audit(1)[0].detail == "object 1, zone -: die is ordered: done"
+        expect(visit("olga").open("/production").get_by_role("button", name="Acknowledge")).to_be_disabled()
+    finally:
+        feed.alarm_level, feed.acknowledged = 0, ("", "")
 
 
 def test_how_often_each_place_deviates_is_drawn(visit: Callable[..., Visit], feed: Feed) -> None:

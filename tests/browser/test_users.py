@@ -61,6 +61,7 @@ def test_the_last_administrator_cannot_be_deleted(visit: Callable[..., Visit], a
     assert accounts.user("ada") is not None
 
 
+@pytest.mark.slow
 def test_nobody_else_comes_to_other_accounts(visit: Callable[..., Visit], accounts: Accounts, hmi: Hmi) -> None:
     for name in ("", "olga", "mats"):
         other = visit(name)

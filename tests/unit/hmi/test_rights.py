@@ -60,6 +60,7 @@ def test_a_viewer_changes_nothing_and_sees_no_more_than_an_operator() -> None:
         (r.MEASURE_BY_HAND, Role.OPERATOR), (r.SET_MODE, Role.OPERATOR), (r.SELECT_OBJECT, Role.OPERATOR),
         (r.OWN_PASSWORD, Role.OPERATOR), (r.SET_CAMERA, Role.MAINTENANCE), (r.SAVE_PICTURE, Role.MAINTENANCE),
         (r.MAKE_TEMPLATE, Role.MAINTENANCE), (r.CALIBRATE, Role.MAINTENANCE), (r.LOG_DIE_SERVICE, Role.MAINTENANCE),
+        (r.ACKNOWLEDGE_ALARM, Role.MAINTENANCE),
         (r.EXPORT_LOG, Role.MAINTENANCE), (r.WATCH_SIGNALS, Role.MAINTENANCE),
         (r.EXPORT_PRODUCTION, Role.ADMINISTRATOR), (r.MANAGE_USERS, Role.ADMINISTRATOR),
     ],

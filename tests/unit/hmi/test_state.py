@@ -103,13 +103,15 @@ def test_the_object_is_what_fieldbus_says_else_the_last_verdicts(told: int | str
 
 
 def test_the_trend_is_that_of_the_current_object() -> None:
-    records = m.Records(rows=(), total=0, trends=(TREND.replace(object_index=1), TREND))
+    whole, zone = TREND.replace(zone=""), TREND.replace(zone="radius")
+    records = m.Records(rows=(), total=0, trends=(whole.replace(object_index=1), zone, whole))
     state = s.with_records(CellState("c"), records, 1.0)
     assert s.trend_of(state) is None
     state = s.with_verdict(state, verdict(1), 1.0)
     trend = s.trend_of(state)
     assert trend is not None
-    assert trend.object_index == 3
+    assert (trend.object_index, trend.zone) == (3, "")
+    assert [t.zone for t in s.trends_of(state)] == ["", "radius"]
 
 
 def test_simulated_is_said_when_any_part_of_the_screen_is() -> None:

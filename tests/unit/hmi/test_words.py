@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.contract.examples import OUTCOME, VERDICT
+from tests.contract.examples import OUTCOME, TREND, VERDICT
 from wearline import messages as m
 from wearline_hmi.core import state as s
 from wearline_hmi.core import words as w
@@ -149,3 +149,19 @@ def test_an_unknown_code_is_named() -> None:
 )
 def test_the_language_is_chosen_from_what_the_browser_wants(wanted: str, code: str) -> None:
     assert chosen(wanted).code == code
+
+
+@pytest.mark.parametrize(
+    ("levels", "age_s", "word", "colour"),
+    [((0, 0), 0.0, "no alarm", "green"), ((0, 4), 0.0, "stop", "red"), ((2, 1), 0.0, "warning", "amber"),
+     ((0, 0), 31.0, "unknown", "grey"), ((), 0.0, "unknown", "grey")],
+)  # fmt: skip
+def test_the_worst_wear_alarm_rules_and_an_old_one_is_unknown(
+    levels: tuple[int, ...], age_s: float, word: str, colour: str
+) -> None:
+    trends = tuple(
+        TREND.replace(zone="" if n == 0 else f"zone {n}", alarm_level=level) for n, level in enumerate(levels)
+    )  # fmt: skip
+    state = s.with_records(CellState("c"), m.Records(rows=(), total=0, trends=trends), 10.0)
+    sign = w.wear_sign(state, 10.0 + age_s)
+    assert (sign.word, sign.colour) == (word, colour)

@@ -93,6 +93,8 @@ MAKE_TEMPLATE = Deed("make a template", Item.CALIBRATION, Access.FULL)
 CALIBRATE = Deed("calibrate", Item.CALIBRATION, Access.FULL)
 LOG_DIE_SERVICE = Deed("log a die service", Item.CALIBRATION, Access.FULL)
 """It sets the point from which wear counts, as a template sets what it is compared with."""
+ACKNOWLEDGE_ALARM = Deed("acknowledge an alarm", Item.LOG, Access.FULL)
+"""Who answers for the die; an operator sees it and calls."""
 EXPORT_PRODUCTION = Deed("export production records", Item.PRODUCT_VIEW, Access.FULL)
 EXPORT_LOG = Deed("export the log", Item.LOG, Access.FULL)
 WATCH_SIGNALS = Deed("watch inputs and outputs", Item.SETTINGS, Access.PART)
@@ -102,7 +104,8 @@ OWN_PASSWORD = Deed("change the own password", Item.USER_CONTROL, Access.OWN)
 DEEDS: tuple[Deed, ...] = (
     LOOK_AT_MEASURING, LOOK_AT_CAMERA, LOOK_AT_PRODUCTION, LOOK_AT_LOG, LOOK_AT_SETTINGS, LOOK_AT_CALIBRATION,
     LOOK_AT_USERS, READ_HELP, SET_CAMERA, SAVE_PICTURE, MEASURE_BY_HAND, SET_MODE, SELECT_OBJECT, MAKE_TEMPLATE,
-    CALIBRATE, LOG_DIE_SERVICE, EXPORT_PRODUCTION, EXPORT_LOG, WATCH_SIGNALS, MANAGE_USERS, OWN_PASSWORD,
+    CALIBRATE, LOG_DIE_SERVICE, ACKNOWLEDGE_ALARM, EXPORT_PRODUCTION,
+    EXPORT_LOG, WATCH_SIGNALS, MANAGE_USERS, OWN_PASSWORD,
 )  # fmt: skip
 
 

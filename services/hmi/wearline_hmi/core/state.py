@@ -312,10 +312,15 @@ def current_object(state: CellState) -> int | None:
     return None if state.verdict is None else state.verdict.request.object_index
 
 
-def trend_of(state: CellState) -> WearTrend | None:
-    """The wear trend of the current object."""
+def trends_of(state: CellState) -> tuple[WearTrend, ...]:
+    """The wear trends of the current object: the whole part first, then its zones."""
     wanted = current_object(state)
-    for trend in state.trends:
-        if trend.object_index == wanted:
-            return trend
-    return state.trends[0] if len(state.trends) == 1 else None
+    found = tuple(trend for trend in state.trends if trend.object_index == wanted)
+    if not found and len({trend.object_index for trend in state.trends}) == 1:
+        found = state.trends
+    return tuple(sorted(found, key=lambda trend: trend.zone))
+
+
+def trend_of(state: CellState) -> WearTrend | None:
+    """The wear trend of the current object as a whole."""
+    return next((trend for trend in trends_of(state) if not trend.zone), None)

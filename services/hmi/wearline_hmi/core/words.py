@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from wearline.messages import CODE_MEANING, ResultCode
+from wearline.messages import CODE_MEANING, ResultCode, WearTrend
 from wearline_hmi.core.language import ENGLISH, Language
-from wearline_hmi.core.state import CellState, Seen, Stroke, current_object
+from wearline_hmi.core.state import CellState, Seen, Stroke, current_object, trends_of
 
 STATE_FRESH_S = 3.0
 STATE_LOST_S = 6.0
@@ -193,6 +193,26 @@ def stroke_sign(row: Stroke, say: Language = ENGLISH) -> Sign:
     if row.told_code is not None and row.told_code >= 10 and row.decision in ("PASSED", "FAILED", "UNSURE"):
         return Sign("amber", "warn", "NOT MEASURED", say(code_text(row.told_code)))
     return Sign(sign.colour, sign.icon, sign.word, row.reason)
+
+
+_ALARMS = (
+    ("green", "check", "no alarm"), ("grey", "dash", "note"), ("amber", "clock", "warning"), ("red", "warn", "action"),
+    ("red", "cross", "stop"),
+)  # fmt: skip
+RECORDS_LOST_S = 30.0
+
+
+def alarm_sign(trend: WearTrend) -> Sign:
+    """The alarm of one zone; its detail is why."""
+    return Sign(*_ALARMS[trend.alarm_level], trend.alarm_reason)
+
+
+def wear_sign(state: CellState, now_s: float) -> Sign:
+    """The worst alarm of the current object; unknown while judge tells no trend."""
+    trends = trends_of(state)
+    if not trends or state.records_at_s is None or now_s - state.records_at_s > RECORDS_LOST_S:
+        return UNKNOWN
+    return alarm_sign(max(trends, key=lambda trend: trend.alarm_level))
 
 
 def pass_rate_text(state: CellState, say: Language = ENGLISH) -> str:

@@ -23,7 +23,7 @@ from wearline_hmi.core import state as cell_state
 from wearline_hmi.core.language import LANGUAGES
 from wearline_hmi.core.rights import Deed
 from wearline_hmi.core.state import CellState
-from wearline_hmi.core.words import Sign, header_words, pass_rate_text, service_sign, verdict_sign
+from wearline_hmi.core.words import Sign, header_words, pass_rate_text, service_sign, verdict_sign, wear_sign
 from wearline_hmi.pages.gate import Door, Doorkeeper, Visitor, door_page, visitor_of
 from wearline_hmi.pages.parts import Look, SignElement, heading
 from wearline_hmi.service import HmiService
@@ -178,7 +178,10 @@ def _glance(page: Frame) -> None:
         heading(page.service.snapshot.cell, 1)
         simulated = ui.label(say("SIMULATED")).classes("simulated")
         facts = {}
-        for key, title in (("ready", "Cell"), ("mode", "Mode"), ("plc", "PLC"), ("verdict", "Last verdict")):
+        titles = (
+            ("ready", "Cell"), ("mode", "Mode"), ("plc", "PLC"), ("verdict", "Last verdict"), ("wear", "Wear alarm"),
+        )  # fmt: skip
+        for key, title in titles:
             with Element("div").classes(f"fact fact-{key}"):
                 ui.label(say(title)).classes("fact-name")
                 facts[key] = SignElement(say)
@@ -199,6 +202,7 @@ def _glance(page: Frame) -> None:
         facts["mode"].show(header.mode)
         facts["plc"].show(header.plc)
         facts["verdict"].show(verdict_sign(state, now_s, page.service.settings.stale_after_s).sign)
+        facts["wear"].show(wear_sign(state, now_s))
         texts["object"].set_text(header.object_text)
         texts["rate"].set_text(pass_rate_text(state, say))
         services.show(services_sign(state, now_s))

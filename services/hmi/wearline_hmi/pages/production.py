@@ -13,15 +13,15 @@ from nicegui import ui
 from nicegui.element import Element
 
 from wearline.errors import BusError
-from wearline.messages import AskRecords, Decision, DieEvent, RecordRow, Records, Verdict
-from wearline.topics import DIE_EVENT, RECORDS
+from wearline.messages import Acknowledge, AskRecords, Decision, DieEvent, RecordRow, Records, Verdict
+from wearline.topics import ACKNOWLEDGE, DIE_EVENT, RECORDS
 from wearline_hmi.core import rights
 from wearline_hmi.core.charts import trend_chart
 from wearline_hmi.core.language import Language
 from wearline_hmi.core.maps import frequency_header
-from wearline_hmi.core.state import CellState, current_object, trend_of
+from wearline_hmi.core.state import CellState, current_object, trend_of, trends_of
 from wearline_hmi.core.table import BOM, csv_lines
-from wearline_hmi.core.words import DASH, code_text, decision_sign, mm_text, ms_text, time_text
+from wearline_hmi.core.words import DASH, alarm_sign, code_text, decision_sign, mm_text, ms_text, time_text
 from wearline_hmi.pages.frame import Frame, Site
 from wearline_hmi.pages.gate import visitor_of
 from wearline_hmi.pages.live import Surface
@@ -280,13 +280,54 @@ def _die_words(what: str, say: Language) -> str:
 
 def _alarms(page: Frame) -> None:
     say = page.look.say
+
+    async def acknowledge() -> None:
+        index = current_object(page.service.snapshot)
+        text = reason.value.strip()[:500]
+        if index is None or not text:
+            ui.notify(say("An acknowledgement says why."), type="negative")
+            return
+        wanted = Acknowledge(object_index=index, zone=zone.value, reason=text)
+        detail = f"object {index}, zone {zone.value or '-'}: {text}"
+        if await page.command(rights.ACKNOWLEDGE_ALARM, ACKNOWLEDGE, wanted, detail):
+            reason.set("")
+
     with panel(say("Alarms"), "area-alarms"):
+        wear = Rows(
+            [
+                Column("zone", say("Zone")), Column("level", say("Level")), Column("reason", say("Reason")),
+                Column("stroke", say("Stroke"), True), Column("by", say("Acknowledged by")),
+            ],
+            say("Wear alarms"), say("No alarm"),
+        )  # fmt: skip
+        with Element("div").classes("filters"):
+            zone = Select(say("Zone"), [("", say("whole part"))], "")
+            reason = Field(say("Reason"))
+            button = Button(say("Acknowledge"), page.guarded(rights.ACKNOWLEDGE_ALARM, acknowledge), "main")
+            lack = why_not(page, rights.ACKNOWLEDGE_ALARM)
+            button.enable(not lack, lack)
         rows = Rows(
             [Column("time", say("Time (UTC)")), Column("level", say("Level")), Column("text", say("Text"))],
-            say("Alarms"), say("No alarm"),
+            say("Warnings and errors of the services"), say("No alarm"),
         )  # fmt: skip
 
     def renew(state: CellState, now_s: float) -> None:
+        trends = trends_of(state)
+        zone.show([(t.zone, t.zone or say("whole part")) for t in trends] or [("", say("whole part"))], zone.value)
+        wear.show(
+            [
+                {
+                    "id": t.zone or "-",
+                    "zone": t.zone or say("whole part"),
+                    "level": sign_cell(alarm_sign(t), say),
+                    "reason": t.alarm_reason,
+                    "stroke": str(t.alarm_stroke),
+                    "by": f"{t.acknowledged_by}: {t.acknowledged_reason}" if t.acknowledged_by else DASH,
+                }
+                for t in trends
+                if t.alarm_level
+            ]
+        )
         rows.show(
             [
                 {
