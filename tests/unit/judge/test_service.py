@@ -356,6 +356,17 @@ def test_a_disk_that_is_really_full_costs_no_record(tmp_path: Path) -> None:
         subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
+def test_one_url_puts_the_records_elsewhere(make: Callable[..., Cell], database: Callable[[str], str]) -> None:
+    cell = make(recipe=ZONED, settings=JudgeSettings(records_url=database("elsewhere")))
+    run(cell, range(1, 4), lambda _: 0.6)
+    cell.restart()
+    found = cell.records()
+    assert (found.total, found.failed) == (3, 3) and found.rows[0].told_code == ResultCode.FAILED
+    assert found.trends[0].alarm_level == AlarmLevel.STOP
+    assert cell.judge.on_wear_map(AskWearMap(object_index=1)).parts == 3
+    assert len(list(cell.stores.records.verified())) == 6
+
+
 def test_records_beyond_the_quota_are_pruned_and_the_chain_still_verifies(make: Callable[..., Cell]) -> None:
     cell = make(settings=JudgeSettings(records_kept=3))
     for stroke in range(1, 6):
