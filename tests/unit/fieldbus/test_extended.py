@@ -242,6 +242,21 @@ def test_a_cut_in_the_middle_of_a_measurement_does_not_cost_it() -> None:
         assert found.shown()["result_valid"] and found.shown()["ok"], verdict_first
 
 
+def test_after_three_seconds_nothing_is_written_for_the_cycle() -> None:
+    found = world()
+    triggered(found)
+    found.now_s += 2.55
+    found.feed(c.Tick())
+    assert found.machine._regions[Result] is Result.TELLING
+    # The link's thread gets round to it only now.
+    found.now_s += 0.5
+    found.poll()
+    assert not found.shown()["result_valid"] and found.shown()["result_code"] == 0
+    assert [(o.code, o.was_told) for o in found.outcomes] == [(10, False)]
+    found.turn(0.2)
+    assert found.shown()["buffer_overrun"] and found.shown()["ready"]
+
+
 def test_two_way_life_counters() -> None:
     found = world()
     ask(found, plc_life=77)
