@@ -26,6 +26,8 @@ from wearline_reconstruct.core.stripes import F32, F64, I64, Bool
 
 NONE = -1
 _NEVER = 1e4
+_LIKELY_WALL = 0.4
+"""A wall of this share of a pitch explains the loss of a line."""
 _BY_HAND = 1e3
 _BY_SPOT = 150.0
 _COLUMN_STEP = 6
@@ -340,7 +342,10 @@ def _neighbours_across(beside: list[_Beside], height: _Heights, rules: _Rules) -
             jump = ((z_below[:, None, :] - z_above[:, :, None]) / height.step_mm).clip(-100.0, 100.0)
             between = (before[np.maximum(below, 0)] - before[np.maximum(above, 0) + 1]).astype(np.float64)
             # Lines that a wall swallows are no surprise.
-            lost = np.maximum(between - np.maximum(rules.wall * jump, 0.0), 0.0)
+            wall = np.maximum(rules.wall * jump, 0.0)
+            # A wall of half a pitch swallows a whole line or none.
+            whole = np.floor(wall)
+            lost = np.maximum(between - whole - np.minimum((wall - whole) / _LIKELY_WALL, 1.0), 0.0)
             gap = np.minimum(lost, 1.0) * rules.missing + np.maximum(lost - 1.0, 0.0) * rules.further
             shown = np.minimum(pair.weight, 40)[:, None, None]
             cost = np.where(is_named, (rules.jump * np.abs(jump) + gap) * shown, 0.0)
