@@ -102,7 +102,7 @@ def test_bright_light() -> None:
         ("step near a pitch", Step(1.0, 6.5, -12.0, "x"), 0.95),
         ("step across the lines", Step(1.0, 5.0, 2.0, "y"), 0.97),
         ("step down", Step(5.0, 1.0, 2.0, "y"), 0.95),
-        # The wall swallows one line, or none and the step is the smaller one the other way: no number is the right answer.
+        # The wall swallows a line, or the step is the smaller one the other way: no number is right.
         ("step that could be another", Step(2.13, 6.43, -10.5, "y"), 0.6),
         ("hole", Hole(Plane(2.0), 14.0, 8.0, 9.0), 0.97),
         ("blind hole", Hole(Plane(4.0), -14.0, 8.0, 9.0, depth_mm=2.5), 0.93),
