@@ -260,6 +260,7 @@ class Feed:
         self._answer("judge", topics.RECIPE, self._recipe)
         self._answer("judge", topics.TEACH, lambda _: m.Done(ok=True, text="object 1: version 3, taught from 3 parts"))
         self._answer("judge", topics.DIE_EVENT, self._on_die_event)
+        self._answer("judge", topics.WEAR_MAP, self._wear_map)
         self._answer("judge", topics.ACKNOWLEDGE, self._on_acknowledge)
         self._answer("fieldbus", topics.MODE, self._on_mode)
         self._answer("fieldbus", topics.SELECT_OBJECT, self._on_select)
@@ -277,6 +278,18 @@ class Feed:
             stroke = self._verdicts[-1].request.stroke if self._verdicts else 0
             self._die_events.append((stroke, f"{wanted.kind}: {wanted.note}" if wanted.note else wanted.kind))
         return m.Done(ok=True, text=f"{wanted.kind} of object {wanted.object_index} recorded at stroke {stroke}")
+
+    def _wear_map(self, question: m.Message) -> m.WearMap:
+        assert isinstance(question, m.AskWearMap)
+        with self._lock:
+            count = len(self._verdicts)
+        difference = maps_mm(50)[2][::5, ::5]
+        share = np.clip((np.abs(difference) - 0.03) / 0.07, 0, 1)
+        slope = np.where(np.abs(difference) > 0.03, difference * 20.0, 0.0)
+        return m.WearMap(
+            object_index=question.object_index, maps=np.stack([share, slope, 0.1 + 0 * slope]).astype(np.float32),
+            square_px=45, origin_px=(180, 200), parts=count,
+        )  # fmt: skip
 
     def _on_acknowledge(self, wanted: m.Message) -> m.Done:
         assert isinstance(wanted, m.Acknowledge)

@@ -95,11 +95,14 @@ def test_a_wear_alarm_is_seen_on_every_screen_and_acknowledged_with_a_reason(
         feed.alarm_level, feed.acknowledged = 0, ("", "")
 
 
-def test_how_often_each_place_deviates_is_drawn(visit: Callable[..., Visit], feed: Feed) -> None:
-    feed.stroke(53)
+def test_where_parts_deviate_is_drawn_as_judge_knows_it(visit: Callable[..., Visit], feed: Feed) -> None:
     page = visit().open("/production")
-    expect(page.locator(".area-frequency .surface")).to_have_attribute("data-painted", re.compile(":frequency$"))
-    expect(page.locator(".area-frequency .age")).to_contain_text("strokes since this service started")
+    surface = page.locator(".area-frequency .surface")
+    expect(surface).to_have_attribute("data-painted", re.compile(r"^1-\d+:frequency$"))
+    page.locator('button[data-wear-map="growth"]').click()
+    expect(surface).to_have_attribute("data-painted", re.compile(":growth$"))
+    expect(page.locator(".area-frequency .surface-legend")).to_contain_text("mm/1000")
+    expect(page.locator(".area-frequency .age")).to_contain_text("parts since the last service")
 
 
 def test_administrators_export_all_records_and_nobody_else_does(

@@ -12,9 +12,21 @@ from typing import Any, ClassVar, Protocol
 
 from wearline.config import CellSettings
 from wearline.errors import BusError
-from wearline.messages import AskRecords, Event, Message, Outcome, Preview, Records, ServiceState, Verdict, View
+from wearline.messages import (
+    AskRecords,
+    AskWearMap,
+    Event,
+    Message,
+    Outcome,
+    Preview,
+    Records,
+    ServiceState,
+    Verdict,
+    View,
+    WearMap,
+)
 from wearline.service import Asker, Health, Service
-from wearline.topics import EVENTS, OUTCOME, PREVIEW, RECORDS, STATES, VERDICT, VIEW, Query, Topic
+from wearline.topics import EVENTS, OUTCOME, PREVIEW, RECORDS, STATES, VERDICT, VIEW, WEAR_MAP, Query, Topic
 from wearline_hmi.config import HmiSettings
 from wearline_hmi.core import state as cell_state
 from wearline_hmi.core.state import CellState
@@ -140,8 +152,21 @@ class HmiService(Service):
         if isinstance(answer, Records):
             self._asks_failed = 0
             self.snapshot = cell_state.with_records(self.snapshot, answer, clock_s)
+            self._ask_wear_map()
         self._ask_at_s = clock_s + period_s
         return ()
+
+    def _ask_wear_map(self) -> None:
+        index = cell_state.current_object(self.snapshot)
+        if self._asker is None or index is None:
+            return
+        try:
+            answer = self._asker.ask(WEAR_MAP, AskWearMap(object_index=index), timeout_s=RECORDS_TIMEOUT_S)
+        except BusError:
+            # The records came a moment ago; the map is asked for again with the next ones.
+            return
+        if isinstance(answer, WearMap):
+            self.snapshot = cell_state.with_wear_map(self.snapshot, answer)
 
     def health(self) -> Health:
         address = "" if self._web is None else self._web.address

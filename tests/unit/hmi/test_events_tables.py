@@ -1,4 +1,4 @@
-"""The event log, CSV, error frequency and the watched signals."""
+"""The event log, CSV, the map of wear and the watched signals."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.contract.examples import CYCLE
 from wearline import messages as m
 from wearline.errors import RecordError
 from wearline_hmi.core import state as s
-from wearline_hmi.core.maps import frequency_bytes, frequency_header
+from wearline_hmi.core.maps import wear_map_bytes, wear_map_header
 from wearline_hmi.core.state import CellState
 from wearline_hmi.core.table import csv_lines, safe_cell
 from wearline_hmi.drivers import event_log
@@ -77,32 +76,22 @@ def test_csv_is_read_back_as_it_was() -> None:
     assert list(csv.reader(csv_lines(rows).splitlines(keepends=True))) == rows
 
 
-def view(cycle_id: str, error: np.ndarray) -> m.View:
-    fields = {**CYCLE, "cycle_id": cycle_id}
-    return m.View(**fields, maps_mm=error[None].astype(np.float32), names=("error",), step_px=4.0, origin_px=(0, 0))
+def test_the_map_of_wear_keeps_its_units_and_what_was_never_seen() -> None:
+    maps = np.array([[[0.25, np.nan]], [[-1.5, np.nan]], [[0.1, np.nan]]], np.float32)
+    wear_map = m.WearMap(object_index=3, maps=maps, square_px=16, origin_px=(0, 0), parts=8)
+    header = wear_map_header(wear_map, 0.1)
+    assert (header.cycle_id, header.rows, header.cols, header.unit) == ("3-8", 1, 2, "mm")
+    assert header.step == pytest.approx(1.6)
+    assert [(scale.unit, scale.high_mm) for scale in header.scales] == [("%", 50.0), ("mm/1000", 2.0)]
+    back = np.frombuffer(wear_map_bytes(wear_map), "<f4").reshape(2, 1, 2)
+    np.testing.assert_allclose(back, [[[25.0, np.nan]], [[-1.5, np.nan]]])
 
 
-def test_how_often_a_place_deviated_counts_only_where_it_was_measured() -> None:
-    state = CellState("c")
-    state = s.with_view(state, view("1", np.array([[0.0, 0.2, np.nan]])), 1.0)
-    state = s.with_view(state, view("2", np.array([[0.0, -0.3, np.nan]])), 2.0)
-    state = s.with_view(state, view("2", np.array([[9.0, 9.0, 9.0]])), 3.0)
-    state = s.with_view(state, view("3", np.array([[0.1, np.nan, np.nan]])), 4.0)
-    assert state.frequency is not None
-    assert state.frequency.views == 3
-    np.testing.assert_allclose(state.frequency.share(), [[1 / 3, 1.0, np.nan]], rtol=1e-6)
-    assert state.view is not None
-    header = frequency_header(state.view, state.frequency)
-    assert (header.names, header.value_unit, header.scales[0].high_mm) == (("frequency",), "%", 100.0)
-    back = np.frombuffer(frequency_bytes(state.frequency), "<f4")
-    np.testing.assert_allclose(back, [100 / 3, 100.0, np.nan], rtol=1e-6)
-
-
-def test_another_object_or_size_begins_anew() -> None:
-    state = s.with_view(CellState("c"), view("1", np.ones((2, 2))), 1.0)
-    state = s.with_view(state, view("2", np.ones((2, 3))), 2.0)
-    assert state.frequency is not None
-    assert state.frequency.views == 1
+def test_a_map_of_wear_without_any_part_has_scales() -> None:
+    maps = np.full((3, 2, 2), np.nan, np.float32)
+    header = wear_map_header(m.WearMap(object_index=1, maps=maps, square_px=16, origin_px=(0, 0), parts=0), None)
+    assert header.unit == "px"
+    assert all(scale.high_mm > scale.low_mm for scale in header.scales)
 
 
 def fieldbus(image_rows: Any) -> m.ServiceState:

@@ -120,6 +120,7 @@ CHINESE: dict[str, str] = {
     "Give a new password": "设置新密码",
     "gone": "已离开",
     "Good to know": "使用须知",
+    "growth of wear": "磨损增长",
     "Handshake": "握手",
     "Heard": "最近消息",
     "height difference": "高度差",
@@ -130,6 +131,7 @@ CHINESE: dict[str, str] = {
     "Holds from the next picture until the service starts anew; the recipe keeps its own.": (
         "从下一幅图像起有效，直到服务重新启动；配方中的设置不变。"
     ),
+    "how often": "频率",
     "In automatic mode the PLC measures.": "自动模式下由 PLC 触发测量。",
     "In manual mode the PLC gets no results. Change the mode?": "手动模式下 PLC 得不到结果。是否切换模式？",
     "In the log and in production everything is searched on the server, also what is not shown.": (
@@ -259,6 +261,7 @@ CHINESE: dict[str, str] = {
     "Part or stroke": "零件或冲程",
     "part passed": "零件合格",
     "Part {part}, stroke {stroke}": "零件 {part}，冲程 {stroke}",
+    "parts:": "零件数：",
     "Pass rate": "合格率",
     "Passed": "合格",
     "PASSED": "合 格",
@@ -412,8 +415,8 @@ CHINESE: dict[str, str] = {
     "{mm} mm per 1000 strokes": "每 1000 次冲程 {mm} mm",
     "{n} days ago": "{n} 天前",
     "{n} min ago": "{n} 分钟前",
+    "{n} parts since the last service": "上次维护后 {n} 个零件",
     "{n} records in all": "共 {n} 条记录",
     "{n} s ago": "{n} 秒前",
     "{n} strokes since the last service": "上次维护后 {n} 次冲程",
-    "{n} strokes since this service started": "本服务启动后 {n} 次冲程",
 }

@@ -130,6 +130,7 @@ GERMAN: dict[str, str] = {
     "Give a new password": "Neues Passwort vergeben",
     "gone": "gegangen",
     "Good to know": "Gut zu wissen",
+    "growth of wear": "Verschleißzuwachs",
     "Handshake": "Handshake",
     "Heard": "Gehört",
     "height difference": "Höhenunterschied",
@@ -140,6 +141,7 @@ GERMAN: dict[str, str] = {
     "Holds from the next picture until the service starts anew; the recipe keeps its own.": (
         "Gilt ab dem nächsten Bild, bis der Dienst neu startet; das Rezept behält seine eigenen Werte."
     ),
+    "how often": "wie oft",
     "In automatic mode the PLC measures.": "Im Automatikbetrieb misst die SPS.",
     "In manual mode the PLC gets no results. Change the mode?": (
         "Im Handbetrieb bekommt die SPS keine Ergebnisse. Betriebsart wechseln?"
@@ -271,6 +273,7 @@ GERMAN: dict[str, str] = {
     "Part or stroke": "Teil oder Hub",
     "part passed": "Teil ist gut",
     "Part {part}, stroke {stroke}": "Teil {part}, Hub {stroke}",
+    "parts:": "Teile:",
     "Pass rate": "Gutanteil",
     "Passed": "Gut",
     "PASSED": "GUT",
@@ -430,8 +433,8 @@ GERMAN: dict[str, str] = {
     "{mm} mm per 1000 strokes": "{mm} mm je 1000 Hübe",
     "{n} days ago": "vor {n} Tagen",
     "{n} min ago": "vor {n} min",
+    "{n} parts since the last service": "{n} Teile seit der letzten Wartung",
     "{n} records in all": "{n} Aufzeichnungen insgesamt",
     "{n} s ago": "vor {n} s",
     "{n} strokes since the last service": "{n} Hübe seit der letzten Wartung",
-    "{n} strokes since this service started": "{n} Hübe seit dem Start dieses Dienstes",
 }

@@ -8,8 +8,9 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wearline.messages import View
-from wearline_hmi.core.state import Frequency
+from wearline.messages import View, WearMap
+
+WEAR_MAPS = ("frequency", "growth")
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,8 @@ class MapScale:
     """height (sequential), signed (diverging about 0) or size (from 0)."""
     relief: float
     """Exaggeration of heights that makes the relief legible."""
+    unit: str = "mm"
+    """Of the map's values."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +42,6 @@ class ViewHeader:
     scales: tuple[MapScale, ...]
     measured_share: float
     """Share of the elements of the standard that the measured map has too, 0-1."""
-    value_unit: str = "mm"
-    """Of the map's values."""
 
 
 def nice_above(value: float) -> float:
@@ -98,19 +99,29 @@ def view_header(view: View) -> ViewHeader:
     return ViewHeader(view.cycle_id, view.stroke, view.names, rows, cols, step, unit, tuple(scales), share)
 
 
-def frequency_header(view: View, frequency: Frequency) -> ViewHeader:
-    """The map of how often each place deviated, on the grid of the views."""
-    rows, cols = frequency.measured.shape
-    step = view.step_px * (view.mm_per_pixel or 1.0)
-    top = float(np.nanmax(100.0 * frequency.share(), initial=0.0))
-    scale = MapScale(0.0, nice_above(max(top, 10.0)), "size", 1.0)
-    unit = "mm" if view.mm_per_pixel else "px"
-    return ViewHeader(view.cycle_id, view.stroke, ("frequency",), rows, cols, step, unit, (scale,), 1.0, "%")
+def wear_map_header(wear_map: WearMap, mm_per_pixel: float | None) -> ViewHeader:
+    """Share of the parts that deviate [%] and growth of wear [mm per 1000 strokes], over squares of the part."""
+    shares, slopes = _wear_maps(wear_map)
+    rows, cols = shares.shape
+    top_share = float(np.nanmax(shares, initial=0.0))
+    top_slope = float(np.nanmax(np.abs(slopes), initial=0.0))
+    scales = (
+        MapScale(0.0, nice_above(max(top_share, 10.0)), "size", 1.0, "%"),
+        MapScale(-nice_above(max(top_slope, 0.01)), nice_above(max(top_slope, 0.01)), "signed", 1.0, "mm/1000"),
+    )
+    step = wear_map.square_px * (mm_per_pixel or 1.0)
+    key = f"{wear_map.object_index}-{wear_map.parts}"
+    return ViewHeader(key, wear_map.parts, WEAR_MAPS, rows, cols, step, "mm" if mm_per_pixel else "px", scales, 1.0)
 
 
-def frequency_bytes(frequency: Frequency) -> bytes:
-    """float32, little-endian, [row, col], in percent; NaN = never measured."""
-    return np.ascontiguousarray(100.0 * frequency.share(), dtype="<f4").tobytes()
+def wear_map_bytes(wear_map: WearMap) -> bytes:
+    """float32, little-endian, [map, row, col] in the units of the header; NaN = no part was seen there."""
+    return np.ascontiguousarray(np.stack(_wear_maps(wear_map)), dtype="<f4").tobytes()
+
+
+def _wear_maps(wear_map: WearMap) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    maps = dict(zip(wear_map.names, wear_map.maps, strict=True))
+    return 100.0 * maps["error_share"], maps["slope_mm_per_kilostroke"]
 
 
 def header_json(header: ViewHeader) -> dict[str, object]:

@@ -10,9 +10,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from wearline.messages import Event, Outcome, Preview, Records, ServiceState, Verdict, View, WearTrend
+from wearline.messages import Event, Outcome, Preview, Records, ServiceState, Verdict, View, WearMap, WearTrend
 from wearline.topics import SERVICES
 
 STROKES_KEPT = 200
@@ -56,24 +55,6 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Frequency:
-    """How often each place of the maps of one object deviated, over the views that were seen."""
-
-    object_key: tuple[int | None, tuple[int, int]]
-    """Object index and size of the maps: another object begins anew."""
-    deviated: NDArray[np.int32]
-    """Strokes with an error there, (row, col)."""
-    measured: NDArray[np.int32]
-    """Strokes with a measurement there, (row, col)."""
-    views: int
-
-    def share(self) -> NDArray[np.float32]:
-        """Share of the measured strokes that deviated, (row, col), 0-1; NaN = never measured."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.where(self.measured > 0, self.deviated / self.measured, np.nan).astype(np.float32)
-
-
-@dataclass(frozen=True)
 class SignalChange:
     """One change of the process image, as seen in fieldbus' states."""
 
@@ -96,7 +77,8 @@ class CellState:
     view_at_s: float | None = None
     view_before: View | None = None
     """A browser may still be fetching it."""
-    frequency: Frequency | None = None
+    wear_map: WearMap | None = None
+    """Where errors are frequent and wear grows, since the last service of the die."""
     signals: tuple[dict[str, Any], ...] = ()
     """Rows of the process image as fieldbus tells them."""
     signal_changes: tuple[SignalChange, ...] = ()
@@ -184,20 +166,12 @@ def with_view(state: CellState, view: View, now_s: float) -> CellState:
     """The snapshot with the newest maps; those that are said again keep their age."""
     if state.view is not None and state.view.cycle_id == view.cycle_id:
         return state
-    frequency = _with_errors(state.frequency, view, current_object(state))
-    return replace(state, view=view, view_at_s=now_s, view_before=state.view, frequency=frequency)
+    return replace(state, view=view, view_at_s=now_s, view_before=state.view)
 
 
-def _with_errors(known: Frequency | None, view: View, object_index: int | None) -> Frequency | None:
-    if "error" not in view.names:
-        return known
-    errors = view.maps_mm[view.names.index("error")]
-    is_measured = np.isfinite(errors)
-    deviates = is_measured & (np.nan_to_num(errors) != 0.0)
-    key = (object_index, (errors.shape[0], errors.shape[1]))
-    if known is None or known.object_key != key:
-        return Frequency(key, deviates.astype(np.int32), is_measured.astype(np.int32), 1)
-    return Frequency(key, known.deviated + deviates, known.measured + is_measured, known.views + 1)
+def with_wear_map(state: CellState, wear_map: WearMap) -> CellState:
+    """The snapshot with judge's map of wear."""
+    return replace(state, wear_map=wear_map)
 
 
 def with_preview(state: CellState, preview: Preview, now_s: float) -> CellState:

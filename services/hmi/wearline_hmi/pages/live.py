@@ -10,7 +10,7 @@ from fastapi.responses import Response
 from nicegui.element import Element
 
 from wearline_hmi.core.charts import Ink
-from wearline_hmi.core.maps import ViewHeader, frequency_bytes, header_json, view_bytes
+from wearline_hmi.core.maps import ViewHeader, header_json, view_bytes, wear_map_bytes, wear_map_header
 from wearline_hmi.service import HmiService
 
 
@@ -46,14 +46,14 @@ def add_live(app: FastAPI, service: HmiService) -> None:
             headers={"Cache-Control": "private, max-age=60, immutable"},
         )
 
-    @app.get("/live/frequency/{cycle_id}.bin", include_in_schema=False)
-    async def frequency(cycle_id: str) -> Response:
-        """float32, little-endian, [row, col]: how often each place deviated. [%]"""
-        found = service.snapshot.frequency
-        if found is None:
-            raise HTTPException(404, "no maps came yet")
+    @app.get("/live/wear/{key}.bin", include_in_schema=False)
+    async def wear(key: str) -> Response:
+        """float32, little-endian, [map, row, col]: how often each square deviates and how its wear grows."""
+        found = service.snapshot.wear_map
+        if found is None or wear_map_header(found, None).cycle_id != key:
+            raise HTTPException(404, "a newer map has replaced this one")
         return Response(
-            frequency_bytes(found), media_type="application/octet-stream", headers={"Cache-Control": "no-store"}
+            wear_map_bytes(found), media_type="application/octet-stream", headers={"Cache-Control": "no-store"}
         )
 
 

@@ -18,7 +18,7 @@ from wearline.topics import ACKNOWLEDGE, DIE_EVENT, RECORDS
 from wearline_hmi.core import rights
 from wearline_hmi.core.charts import trend_chart
 from wearline_hmi.core.language import Language
-from wearline_hmi.core.maps import frequency_header
+from wearline_hmi.core.maps import WEAR_MAPS, wear_map_header
 from wearline_hmi.core.state import CellState, current_object, trend_of, trends_of
 from wearline_hmi.core.table import BOM, csv_lines
 from wearline_hmi.core.words import DASH, alarm_sign, code_text, decision_sign, mm_text, ms_text, time_text
@@ -28,6 +28,7 @@ from wearline_hmi.pages.live import Surface
 from wearline_hmi.pages.measurement import why_not
 from wearline_hmi.pages.parts import (
     Button,
+    Choice,
     Column,
     Field,
     Rows,
@@ -63,7 +64,7 @@ def build_production(page: Frame) -> None:
         _products(page)
         with Element("div").classes("area-side stack"):
             _trend(page)
-            _frequency(page)
+            _wear_map(page)
             _die_service(page)
             _alarms(page)
 
@@ -218,19 +219,22 @@ def _trend(page: Frame) -> None:
     follow_trend(page, chart, sentence, can_zoom=True)
 
 
-def _frequency(page: Frame) -> None:
+def _wear_map(page: Frame) -> None:
     say = page.look.say
     with panel(say("Where parts deviate, and how often"), "area-frequency") as box:
         with box.default_slot.children[0]:
             note = ui.label().classes("age")
-        surface = Surface({**surface_words(say), "frequency": say("Where parts deviate, and how often")})
+        words = {"frequency": say("how often"), "growth": say("growth of wear"), "stroke": say("parts:")}
+        surface = Surface({**surface_words(say), **words})
         surface.paint("flat")
         surface.choose("frequency")
+        Choice(say("Map"), [(name, words[name]) for name in WEAR_MAPS], "frequency", surface.choose, "wear-map")
 
     def renew(state: CellState, now_s: float) -> None:
-        if state.view is not None and state.frequency is not None:
-            surface.show(frequency_header(state.view, state.frequency), "frequency")
-            note.set_text(say("{n} strokes since this service started", n=state.frequency.views))
+        if state.wear_map is not None and state.wear_map.maps.size:
+            scale = None if state.view is None else state.view.mm_per_pixel
+            surface.show(wear_map_header(state.wear_map, scale), "wear")
+            note.set_text(say("{n} parts since the last service", n=state.wear_map.parts))
 
     page.renewed_by(renew)
 

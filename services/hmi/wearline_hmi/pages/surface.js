@@ -72,7 +72,7 @@ export default {
       <div class="surface-tip" v-if="tip" :style="{left: tip.x + 'px', top: tip.y + 'px'}">{{ tip.text }}</div>
       <div class="surface-legend" v-if="scale" aria-hidden="true">
         <span>{{ number(scale.high_mm) }}</span><div :style="{background: gradient}"></div>
-        <span>{{ number(scale.low_mm) }} {{ header.value_unit }}</span>
+        <span>{{ number(scale.low_mm) }} {{ scale.unit }}</span>
       </div>
       <div class="surface-foot" v-if="scale">{{ foot }}</div>
       <div class="surface-length" v-if="length" role="status">{{ length }}</div>
@@ -302,10 +302,10 @@ export default {
       if (event.buttons) { this.tip = null; return; }
       const p = this.pick(event);
       const box = this.$el.getBoundingClientRect();
-      const unit = this.header?.unit, unit2 = this.header?.value_unit;
+      const unit = this.header?.unit, unit2 = this.scale?.unit;
       this.tip = p && {
         x: Math.min(event.clientX - box.left + 14, box.width - 190), y: Math.max(event.clientY - box.top - 34, 2),
-        text: `x ${this.plain(p.col * this.gap, 1)}  y ${this.plain(p.row * this.gap, 1)} ${unit}   ${this.plain(p.value, unit2 === "mm" ? 3 : 0)} ${unit2}`,
+        text: `x ${this.plain(p.col * this.gap, 1)}  y ${this.plain(p.row * this.gap, 1)} ${unit}   ${this.plain(p.value, unit2 === "%" ? 0 : 3)} ${unit2}`,
       };
     },
     onDown(event) { this.downAt = [event.clientX, event.clientY]; },
