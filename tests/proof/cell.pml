@@ -370,7 +370,8 @@ end:
 /* --- the PLC's program: what answers its Measure, it believes; it may lose patience --- */
 #define mine (!NUMBERED || echo(db_b) == q_number)
 #define answered (finished(db_a) && (finished(db_b) || BLIND_TO_CODE) && mine)
-#define believed (good(db_a) && (good(db_b) || BLIND_TO_CODE))
+/* On wires half a is Ready and Measure finished, half b is Passed and Failed. */
+#define believed ((good(db_a) || WIRES) && (good(db_b) || BLIND_TO_CODE))
 #define pause_kept (NUMBERED || !PAUSE || ((!timing || age >= 3) && len(inbox) == 0 && len(todo) == 0))
 inline next_part() {
     awaited = false; part++; is_good = false;

@@ -40,6 +40,8 @@ QUICK = BATTERY[:3]
 """Searches of a second or two."""
 WALK = ("tests/proof/test_walk.py::test_no_invariant_is_broken",)
 UNIT = ("tests/unit/fieldbus/test_handshake.py", "tests/unit/fieldbus/test_handshake_machine.py")
+NAMES = "tests/unit/fieldbus/test_handshake.py::test_the_table_names_only_guards_and_effects_that_exist_and_uses_all_of_them"
+"""Left out: it compares names, so it would object without looking at what the machine does."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ def objection_of_code(left_out: Sequence[Guard], tests: Sequence[str]) -> Verdic
         "WEARLINE_WALK_TRIGGERS": "5000",
     }
     run = subprocess.run(
-        [sys.executable, "-m", "pytest", "-x", "-p", "tests.proof.without", *tests],
+        [sys.executable, "-m", "pytest", "-x", "-p", "tests.proof.without", "--deselect", NAMES, *tests],
         cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900.0, check=False,
     )  # fmt: skip
     first = next((line for line in run.stdout.splitlines() if line.startswith("FAILED")), "")
@@ -97,8 +99,9 @@ def objection(bench: Bench, left_out: Sequence[Guard]) -> Verdict | None:
     seen = any(is_seen_by_model(guard) for guard in left_out)
     return (
         (objection_of_model(bench, left_out, QUICK) if seen else None)
+        or objection_of_code(left_out, UNIT[:1])
         or objection_of_code(left_out, WALK)
-        or objection_of_code(left_out, UNIT)
+        or objection_of_code(left_out, UNIT[1:])
         or (objection_of_model(bench, left_out, BATTERY[len(QUICK) :]) if seen else None)
     )
 

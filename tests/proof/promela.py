@@ -39,6 +39,7 @@ PARAMETERS: Mapping[str, int] = {
     "HASTY": 0,
     "FORGETS": 0,
     "BLIND_TO_CODE": 0,
+    "WIRES": 0,
 }
 """How many faults, which kinds there are, what the PLC does, and which assumptions hold; `cell.pml` obeys them."""
 

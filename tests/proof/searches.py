@@ -37,6 +37,7 @@ DEFAULT = (
     Wanted("PLC waits 3 s, one fault of every kind", {"FAULTS": 1, "STRICT": 1, **EVERYTHING}),
     Wanted("no livelock, one cut or kill", {"FAULTS": 1, "STRICT": 1, "CUT": 1, "KILL": 1}, is_liveness=True),
     Wanted("not numbered, pause kept, no write comes late", {"NUMBERED": 0, "FAULTS": 1, "CUT": 1}),
+    Wanted("4 + 4 wires, not sampled as one", {"NUMBERED": 0, "WIRES": 1, "FAULTS": 1, "STRICT": 1, "TORN": 1}),
     Wanted("not numbered, WITHOUT the pause", {"NUMBERED": 0, "FAULTS": 0, "PAUSE": 0}, violates=PASSED),
     Wanted("not numbered, PLC does not look at Ready", {"NUMBERED": 0, "FAULTS": 0, "HASTY": 1}, violates=PASSED),
     Wanted(
@@ -60,6 +61,7 @@ LARGE = (
         "no livelock, one cut, kill or PLC restart", {"FAULTS": 1, "STRICT": 1, "CUT": 1, "KILL": 1, "PLC_RESTART": 1},
         is_liveness=True,
     ),
+    Wanted("4 + 4 wires, two not sampled as one", {"NUMBERED": 0, "WIRES": 1, "FAULTS": 2, "TORN": 1}),
     Wanted("not numbered, one cut or kill", {"NUMBERED": 0, "FAULTS": 1, "CUT": 1, "KILL": 1}),
     Wanted(
         "code not compared, a late write TORN", {"FAULTS": 2, "LATE": 1, "TORN": 1, "BLIND_TO_CODE": 1}, violates=OTHERS

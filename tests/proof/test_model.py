@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.proof import pages
 from tests.proof.promela import SOURCE, is_modelled, meant, model_text
 from tests.proof.run import Bench, is_as_wanted
 from tests.proof.searches import DEFAULT, LARGE, Wanted
@@ -61,6 +62,12 @@ def test_everything_has_a_meaning() -> None:
     assert {row.effect for row in rows} <= set(inlines)
     for row in rows:
         assert row.event.__name__.upper() in SOURCE.read_text(encoding="utf-8"), row.event
+
+
+def test_the_page_shows_the_table() -> None:
+    """After a wanted change: ``python -m tests.proof.pages``."""
+    page = pages.HANDSHAKE.read_text(encoding="utf-8")
+    assert pages.handshake_page(page) == page
 
 
 @needs_spin
