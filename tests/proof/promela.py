@@ -7,8 +7,8 @@ Each guard of the table is wrapped, so that it can be left out without compiling
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
 
@@ -65,6 +65,16 @@ def guards() -> tuple[Guard, ...]:
     places = [(index, name) for index, row in enumerate(TABLE) for name in row.guards]
     places_ready: list[tuple[int | None, str]] = [(None, name) for name in READY]
     return tuple(Guard(n, row, name) for n, (row, name) in enumerate([*places, *places_ready], start=1))
+
+
+def without(left_out: Iterable[Guard]) -> tuple[tuple[Row, ...], tuple[str, ...]]:
+    """TABLE and READY of the real code with these guards left out."""
+    gone = {(guard.row, guard.name) for guard in left_out}
+    table = tuple(
+        replace(row, guards=tuple(name for name in row.guards if (index, name) not in gone))
+        for index, row in enumerate(TABLE)
+    )
+    return table, tuple(name for name in READY if (None, name) not in gone)
 
 
 def is_modelled(row: Row) -> bool:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from tests.proof.plc import IMAGE_BYTES, Believed, ReferencePlc, Step
 from wearline.messages import Decision, MeasureRequest, Outcome, Verdict
 from wearline_fieldbus.core import cycle as c
-from wearline_fieldbus.core.handshake import Handshake, Recovered, State
+from wearline_fieldbus.core.handshake import READY, TABLE, Handshake, Recovered, Row, State
 from wearline_fieldbus.core.profiles import BASIC
 
 SETTINGS = c.HandshakeSettings()
@@ -50,8 +50,11 @@ class BrokenError(AssertionError):
 class Walk:
     """One cell whose every step is drawn from ``seed``."""
 
-    def __init__(self, seed: int, fault_rate: float = 0.01) -> None:
-        """``fault_rate``: faults per step of 20 ms."""
+    def __init__(
+        self, seed: int, fault_rate: float = 0.01, table: tuple[Row, ...] = TABLE, ready: tuple[str, ...] = tuple(READY)
+    ) -> None:
+        """``fault_rate``: faults per step of 20 ms; another ``table`` and ``ready`` for mutations."""
+        self.table, self.ready = table, ready
         self.random = random.Random(seed)
         self.seed, self.fault_rate = seed, fault_rate
         self.now_s = 1000.0
@@ -83,7 +86,14 @@ class Walk:
 
     def _start(self) -> None:
         self.starts += 1
-        self.machine = Handshake(BASIC, SETTINGS, plc_is_simulated=True, cycle_prefix=f"s{self.starts}")
+        self.machine = Handshake(
+            BASIC,
+            SETTINGS,
+            plc_is_simulated=True,
+            cycle_prefix=f"s{self.starts}",
+            table=self.table,
+            ready=self.ready,
+        )
         self.queue.clear()
         self.linked = False
         self.link_back_s = self.now_s + self.random.uniform(0.02, 0.5)
