@@ -1,4 +1,4 @@
-"""What is generated of two pages: the machine in docs/explanation/handshake.md, docs/reference/handshake-proof.md.
+"""What is generated of two pages: the machine in docs/explanation/handshake-proof.md, docs/reference/handshake-proof.md.
 
 After a wanted change of the table: ``python -m tests.proof.pages`` and commit what it wrote.
 """
@@ -15,7 +15,7 @@ from tests.proof.promela import is_modelled
 from wearline_fieldbus.core.handshake import READY, TABLE, State
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-HANDSHAKE = DOCS / "explanation" / "handshake.md"
+HANDSHAKE = DOCS / "explanation" / "handshake-proof.md"
 PROOF = DOCS / "reference" / "handshake-proof.md"
 START, END = "<!-- machine -->\n", "<!-- end of machine -->"
 
@@ -73,7 +73,7 @@ def proof_page() -> str:
         "`tests/proof/cell.pml`), the random walk of the real code and its unit tests then had to object. A guard for",
         "which another one stands in was left out together with that one. Made by `make handshake-mutations` and",
         "`python -m tests.proof.pages`; what is proven, and under which assumptions, says",
-        "[the handshake](../explanation/handshake.md).",
+        "[what is proven](../explanation/handshake-proof.md).",
         "",
         f"**{len(killed)} of {len(verdicts)}** were objected to: {by_model} by the model, {len(killed) - by_model}",
         f"by tests of the real code; {pairs} of them only in a pair.",
