@@ -1,4 +1,4 @@
-"""What is generated of two pages: the machine in docs/explanation/handshake-proof.md, docs/reference/handshake-proof.md.
+"""What is generated of docs/explanation/handshake-proof.md (the machine) and docs/reference/handshake-proof.md.
 
 After a wanted change of the table: ``python -m tests.proof.pages`` and commit what it wrote.
 """
