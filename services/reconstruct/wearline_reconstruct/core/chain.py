@@ -420,7 +420,7 @@ def _measured(
     vibration = float(calibration.meta.get("vibration_px", 0.05)) * float(np.median(slope[::19])) if len(slope) else 0.0
     common = float(np.hypot(vibration, float(calibration.meta.get("z_sigma_common_mm", 0.0))))
     sigma = np.sqrt(posterior**2 + calibration.z_sigma_mm[line, along] ** 2 + vibration**2)
-    good = np.isfinite(z) & np.isfinite(sigma) & ~is_rejected
+    good = np.isfinite(z) & np.isfinite(sigma) & ~is_rejected & (z >= low) & (z <= high)
     if recipe.roi is not None:
         x, y, width, height = recipe.roi
         row, col = (along, across) if calibration.is_vertical else (across, along)
