@@ -17,6 +17,7 @@ from wearline.metrics import gauge
 from wearline.recipe import Recipe, parse_recipe
 from wearline_judge.core.alarms import Acknowledged, Alarm, AlarmLevel, AlarmSettings, acknowledge, serviced, step
 from wearline_judge.core.comparison import Comparison
+from wearline_judge.core.decision import has_limits
 from wearline_judge.core.forecast import RESTARTS
 from wearline_judge.core.judgement import Setup
 from wearline_judge.core.signs import read_signs
@@ -184,17 +185,17 @@ class Trends:
             return None
 
     def _limit(self, index: int, zone: str, means: list[float], wears: list[float]) -> float | None:
+        """The wear at which a zone fails a part; None where none is set. [mm]"""
         recipe = self._recipe(index)
-        if recipe is None:
+        own = next((z for z in recipe.zones if z.name == zone), None) if recipe is not None else None
+        if recipe is None or (zone != PART and own is None):
             return None
-        if zone != PART:
-            own = next((z for z in recipe.zones if z.name == zone), None)
-            if own is None:
-                return None
-            recipe = recipe.model_copy(
-                update={"limits": own.limits, "precision_mm": own.precision_mm or recipe.precision_mm}
-            )
-        return wear_limit(recipe, means, wears)
+        limits = recipe.limits if own is None else own.limits
+        if has_limits(recipe) and limits.max_error_mm is None and limits.mean_error_mm is None:
+            # The precision fails a part only where the recipe limits nothing at all.
+            return None
+        precision_mm = (own.precision_mm if own is not None else None) or recipe.precision_mm
+        return wear_limit(recipe.model_copy(update={"limits": limits, "precision_mm": precision_mm}), means, wears)
 
     def _refreshed(self, index: int, zone: str) -> Alarm:
         """Fit one zone anew, climb or descend its ladder, and keep both."""
