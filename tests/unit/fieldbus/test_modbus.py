@@ -301,7 +301,7 @@ def test_eight_wires_measure_and_a_broken_link_is_safe(module: IoModule, tmp_pat
         proxy.close()
 
 
-def test_no_exchange_with_the_module_blocks_longer_than_half_a_second(module: IoModule) -> None:
+def test_no_exchange_with_the_module_blocks_longer_than_its_time_out(module: IoModule) -> None:
     proxy = Proxy(module.port)
     wires = DigitalIo(DigitalIoSettings(port=proxy.port), 20, 0.2)
     try:
@@ -312,7 +312,7 @@ def test_no_exchange_with_the_module_blocks_longer_than_half_a_second(module: Io
             with pytest.raises(DeviceError, match="does not answer"):
                 for _ in range(3):
                     wires.read()
-            assert time.monotonic() - began < 0.5
+            assert time.monotonic() - began < 1.0
             proxy.fault("pass")
             wires.connect()
         refusing = DigitalIo(DigitalIoSettings(port=proxy.port, first_input=4000), 20, 0.2)
