@@ -253,13 +253,13 @@ def _numbered(strip: Image, found: Fragments, prepared: Prepared) -> tuple[I64, 
     """Line number per peak, and the spot."""
     calibration, pitch = prepared.calibration, prepared.scale.pitch_px
     spots = find_spots(strip, prepared.scale, prepared.search) if prepared.search else []
-    if prepared.search is not None and not spots:
-        _refuse_spot_elsewhere(strip, prepared)
     if prepared.gate is not None:
         number = number_by_gate(found, prepared.gate)
         spot = _check_against_template(number, found, spots, prepared.gate, prepared)
         return number, spot
     spots = _spots_in_range(spots, prepared)
+    if prepared.search is not None and not spots:
+        _refuse_spot_elsewhere(strip, prepared)
     numbers = number_fragments(
         found, calibration, pitch, spots, prepared.recipe.line_constraints, prepared.settings.numbering
     )
