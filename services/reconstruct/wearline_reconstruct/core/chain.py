@@ -258,7 +258,7 @@ def _numbered(strip: Image, found: Fragments, prepared: Prepared) -> tuple[I64, 
         spot = _check_against_template(number, found, spots, prepared.gate, prepared)
         return number, spot
     spots = _spots_in_range(spots, prepared)
-    if prepared.search is not None and not spots:
+    if prepared.search is not None and not spots and not prepared.recipe.line_constraints:
         _refuse_spot_elsewhere(strip, prepared)
     numbers = number_fragments(
         found, calibration, pitch, spots, prepared.recipe.line_constraints, prepared.settings.numbering
