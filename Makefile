@@ -68,7 +68,8 @@ kill-writers: .venv/ready-dev ## kill -9 while records are written, 200 times ea
 
 plc-faults: .venv/ready-dev ## Every network fault at every step of a PLC cycle, and 3000 random histories (long)
 	@.venv/bin/python -m pytest -m slow -s tests/faults/test_plc_faults.py $(T)
-	@WEARLINE_FAULT_EXAMPLES=3000 .venv/bin/python -m pytest tests/unit/fieldbus/test_handshake_machine.py --timeout 1800
+	@WEARLINE_FAULT_EXAMPLES=3000 .venv/bin/python -m pytest tests/unit/fieldbus/test_handshake_machine.py \
+	    tests/unit/fieldbus/test_extended.py -k Faults --timeout 1800
 
 proof: .venv/ready-dev ## Search the model of the PLC handshake exhaustively, small and large size (needs spin, gcc); T=--stories
 	@.venv/bin/python -m tests.proof.run $(T)

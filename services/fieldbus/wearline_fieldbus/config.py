@@ -48,6 +48,7 @@ class FieldbusSettings(Settings):
             raise ValueError("profile extended is always numbered: leave handshake.numbered true")
         if self.plc.kind == "modbus" and self.modbus.port is None:
             raise ValueError("plc.kind modbus needs modbus.port, the port that the PLC connects to")
+        make_profile(self)
         return self
 
 

@@ -206,6 +206,8 @@ def test_settings(tmp_path: Path) -> None:
     cell = CellSettings(cell="c", data_dir=tmp_path)
     with pytest.raises(ConfigError, match=r"fieldbus\.remap"):
         build(cell, FieldbusSettings(remap={"echo": "-"}))
+    with pytest.raises(ConfigError, match="two writers"):
+        validated(FieldbusSettings, {"remap": {"echo": "8"}}, "cell.yaml")
     service = build(cell, FieldbusSettings(plc={"kind": "memory"}))  # type: ignore[arg-type]
     service.close()
     with pytest.raises(ConfigError, match="silent_after_s"):
