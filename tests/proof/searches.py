@@ -33,7 +33,7 @@ OTHERS = "j_number"
 
 DEFAULT = (
     Wanted("PLC may lose patience at any moment, no fault", {"FAULTS": 0}, parts=3),
-    Wanted("PLC may lose patience, one cut, kill or late write", {"FAULTS": 1, "CUT": 1, "KILL": 1, "LATE": 1}),
+    Wanted("PLC may lose patience, one cut or kill", {"FAULTS": 1, "CUT": 1, "KILL": 1}),
     Wanted("PLC waits 3 s, one fault of every kind", {"FAULTS": 1, "STRICT": 1, **EVERYTHING}),
     Wanted("no livelock, one cut or kill", {"FAULTS": 1, "STRICT": 1, "CUT": 1, "KILL": 1}, is_liveness=True),
     Wanted("not numbered, pause kept, no write comes late", {"NUMBERED": 0, "FAULTS": 1, "CUT": 1}),

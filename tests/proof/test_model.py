@@ -8,12 +8,14 @@ from collections.abc import Iterator
 import pytest
 
 from tests.proof import pages
-from tests.proof.promela import SOURCE, is_modelled, meant, model_text
+from tests.proof.promela import SOURCE, guards, is_modelled, meant, model_text
 from tests.proof.run import Bench, is_as_wanted
 from tests.proof.searches import DEFAULT, LARGE, Wanted
 from tests.proof.spin import HEADER, Search, missing
 from wearline_fieldbus.core.handshake import READY, TABLE
 
+# A search of a few seconds may take minutes beside other jobs.
+pytestmark = pytest.mark.timeout(900)
 needs_spin = pytest.mark.skipif(bool(missing()), reason=missing())
 
 
@@ -68,6 +70,27 @@ def test_the_page_shows_the_table() -> None:
     """After a wanted change: ``python -m tests.proof.pages``."""
     page = pages.HANDSHAKE.read_text(encoding="utf-8")
     assert pages.handshake_page(page) == page
+
+
+@needs_spin
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("told + Image -> show_idle: result_is_taken", {"FAULTS": 0, "STRICT": 1}),
+        ("idle + Image -> accept: measure_rises", {"FAULTS": 0, "STRICT": 1}),
+        ("measuring + Tick -> decide_late: answer_is_due", {"FAULTS": 0, "STRICT": 1}),
+        ("telling + Written -> confirm_told: write_is_the_result", {"FAULTS": 0, "STRICT": 1}),
+        ("measuring + Image -> decide_recipe_changed: object_differs", {"FAULTS": 0}),
+        (
+            "measuring + VerdictCame -> decide_by_verdict: verdict_is_of_cycle",
+            {"FAULTS": 0, "STRICT": 1, "NUMBERED": 0},
+        ),
+    ],
+)
+def test_the_model_objects_where_a_guard_is_left_out(name: str, parameters: dict[str, int], bench: Bench) -> None:
+    """The short form of ``make handshake-mutations``."""
+    guard = next(guard for guard in guards() if str(guard) == name)
+    assert bench.search(Wanted(name, parameters), [guard.number]).error
 
 
 @needs_spin
