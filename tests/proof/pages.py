@@ -77,7 +77,7 @@ def proof_page() -> str:
         "",
         f"**{len(killed)} of {len(verdicts)}** were objected to: {by_model} by the model, {len(killed) - by_model}",
         f"by tests of the real code; {pairs} of them only in a pair. Where nobody objected, the last column says",
-        "what was tried; such a guard may be redundant, or the tests too weak: it is not known until the whole run has been made.",
+        "what was tried; such a guard may be redundant, or the tests too weak: only the whole run tells.",
         "",
         "| Left out | Objects | What it says |",
         "|---|---|---|",
