@@ -23,6 +23,8 @@ void main() {
   float z = at(p);
   value = texelFetch(colours, p, 0).r;
   isThere = z > -1e8 && value > -1e8 ? 1.0 : 0.0;
+  // At the rim of a hole the huge sentinel would leave hairlines of any colour.
+  if (isThere < 0.5) value = 0.0;
   float shown = isThere > 0.5 ? (z - middle) * relief : 0.0;
   float dx = slope(at(p - ivec2(1, 0)), z, at(p + ivec2(1, 0))) * relief / gap;
   float dy = -slope(at(p - ivec2(0, 1)), z, at(p + ivec2(0, 1))) * relief / gap;
